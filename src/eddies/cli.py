@@ -71,7 +71,7 @@ def run(arguments: list[str] | None) -> int:
     """Run one command on all ranks and return its exit code."""
     # Before numpy and torch are imported, which would start a thread for each core in each rank.
     default_to_one_thread()
-    from eddies.kernels.memory import keep_freed_memory
+    from eddies.kernels.library import keep_freed_memory
     keep_freed_memory()
     signals = catch_signals()  # early, because MPI takes a second to start
     try:

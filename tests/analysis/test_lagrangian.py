@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from eddies.analysis.lagrangian import (
-    correlation, differences, increment_flatness, minimum_image, near_tetrads, nearest_rows, pair_dispersion, pairs_at,
-    path_statistics, separations, structure_function, tetrad_moments,
+    correlation, differences, increment_flatness, minimum_image, near_tetrads, nearest_rows, pairs_at, path_statistics,
+    structure_function, tetrad_moments,
 )
 
 LENGTH, TIMES = 2 * np.pi, 0.1 * np.arange(8)
@@ -96,15 +96,6 @@ def test_turning_velocities():
     assert structure_function(jump, np.array([1, 2, 3])) == pytest.approx([3.0, 9.0, 9.0])
 
 
-def test_separations_of_pairs_that_leave_through_the_faces_are_continuous():
-    time = np.linspace(0, 10, 41)
-    start, velocity = np.array([[0.1, 6.0, 3.0], [6.2, 0.3, 3.0]]), np.array([[1.5, -2.0, 0.3], [-1, 0.5, 0]])
-    path = start + time[:, None, None] * velocity
-    found = np.array(list(separations(path % LENGTH, np.array([0]), np.array([1]), LENGTH)))
-    assert np.allclose(found[0], [[0.1 - 6.2 + LENGTH, 6.0 - 0.3 - LENGTH, 0.0]])  # the nearest image
-    assert np.allclose(found - found[0], (path[:, :1] - path[:, 1:]) - (path[0, :1] - path[0, 1:]))
-
-
 @pytest.mark.parametrize("shift", [0.0, -0.7, LENGTH], ids=["in the box", "across a face", "in the next box"])
 def test_all_pairs_at_a_distance(shift):
     position = (np.random.default_rng(4).uniform(0, LENGTH, (300, 3)) + shift).astype(np.float32)
@@ -115,14 +106,6 @@ def test_all_pairs_at_a_distance(shift):
     for distance, pairs in zip(distances, found):
         assert np.array_equal(pairs, np.nonzero(np.abs(apart - distance) <= 0.1 * distance))
     assert pairs_at(position, LENGTH, [1e-6], 0.1, followed=40)[0].shape == (2, 0)
-
-
-def test_pairs_that_part_at_constant_velocity():
-    time = np.linspace(0, 4, 21)
-    velocity = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
-    position = np.array([[1.0, 2.0, 3.0]] * 3) + time[:, None, None] * velocity
-    dispersion, = pair_dispersion(position % LENGTH, [np.array([[0, 1], [1, 2]])], LENGTH)
-    assert np.allclose(dispersion, 2 * time**2)
 
 
 def test_increments_of_normal_velocities_have_flatness_three():

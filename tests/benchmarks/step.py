@@ -31,7 +31,7 @@ from eddies.kernels.copies import PlaneCopies
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.transpose import Transpose
 from eddies.spectral.fourier_passes import PlanePass
-from eddies.spectral.spectral_grid import Collector, SpectralGrid
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ETDRK4
 
 EVALUATIONS = 4              # of the nonlinear term in a step
@@ -41,7 +41,7 @@ TRIAD_BYTES = 2**25          # size of an array that no cache holds
 # Functions of each part, by owner and name. A call within a call of another part counts for the inner part only.
 PARTS = {
     "plane transforms": [(PlanePass, "to_physical"), (PlanePass, "to_modes")],
-    "column transforms": [(SpectralGrid, "_columns_to_planes"), (Collector, "modes")],
+    "column transforms": [(SpectralGrid, "_columns_to_planes"), (SpectralGrid, "_planes_to_columns")],
     "transposes": [(Transpose, "to_planes"), (Transpose, "to_columns")],
     "pairs of planes": [(PlaneCopies, "pack"), (PlaneCopies, "unpack")],
     "products": [(CompressibleFluid, "_advection")],

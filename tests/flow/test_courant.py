@@ -14,7 +14,7 @@ from tests.validation.flows import make_grid
 def test_a_restored_limit_keeps_its_step_until_the_next_measurement(comm):
     grid = make_grid(comm, 8)
     slow, fast, clock = taylor_green(grid, 1.0), taylor_green(grid, 4.0), Clock()
-    limit, restored, fresh = (CourantLimit(grid, 0.5, 1.0, every=8) for _ in range(3))
+    limit, restored, fresh = (CourantLimit(grid, 0.5, 1.0) for _ in range(3))
     step = limit(slow, clock)
     clock.steps = 3  # the next measurement is at step 8, although the flow is faster now
     restored.load_state_dict(limit.state_dict())
@@ -35,12 +35,11 @@ def test_the_last_step_ends_at_the_end(comm):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("sound_speed", [0.1, 100.0])
-def test_a_courant_number_of_1_3_keeps_the_explicit_stepper_just_stable(comm, sound_speed):
+def test_a_courant_number_of_1_3_keeps_the_explicit_stepper_just_stable(comm):
     # k_max dx is at most 2 pi / 3, and 1.35 times that is 2.83.
     grid = make_grid(comm, 32)
-    fluid, velocity = CompressibleFluid(grid, 0.0, sound_speed), taylor_green(grid, 1.0)
-    step = CourantLimit(grid, 1.3, 1.0, sound_speed).bound(velocity, Clock())
+    fluid, velocity = CompressibleFluid(grid, 0.0, 3.0), taylor_green(grid, 1.0)
+    step = CourantLimit(grid, 1.3, 1.0, 3.0).bound(velocity, Clock())
     limits = step_limits(fluid, RungeKutta4(fluid), step, advective_speed(grid, velocity))
     assert not any(limit.exceeded for limit in limits) and limits[1].number > 2.5
 

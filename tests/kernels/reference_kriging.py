@@ -3,11 +3,11 @@
 import numpy as np
 
 from eddies.kernels.kriging import MOST_NEIGHBORS
-from eddies.particles.kriging import NOISE
+from eddies.particles.kriging import NOISE, covariance
 from eddies.particles.moments import ENTRIES
 
 
-def solved(offsets, displacement, support, covariance, sited=True):
+def solved(offsets, displacement, support, filter_width, sited=True):
     """The receivers' own weights (10, k) and their neighbours' (10, m) for displacements (m, 3) x_i - x_j; see
     `eddies.particles.kriging.kriging_weights`."""
     offsets, away = np.asarray(offsets), -np.asarray(displacement, float)
@@ -15,19 +15,19 @@ def solved(offsets, displacement, support, covariance, sited=True):
     for receiver, (first, last) in enumerate(zip(offsets[:-1], offsets[1:])):
         if last - first <= MOST_NEIGHBORS:
             places = np.concatenate([np.zeros((int(sited), 3)), away[first:last]])
-            weights = _weights(places, support, covariance, sited)
+            weights = _weights(places, support, covariance(filter_width), sited)
             own[:, receiver] = weights[0] if sited else 0
             others[:, first:last] = weights[int(sited):].T
     return own, others
 
 
-def _weights(places, support, covariance, sited):
+def _weights(places, support, given, sited):
     """Weights (p, 10) of the values at some places relative to the receiver; the first is its own if it is `sited`."""
     distance = np.linalg.norm(places, axis=1)
     noise = NOISE / np.maximum(1 - (distance / support) ** 4, 1e-4)
     apart = np.sum((places[:, None] - places) ** 2, axis=2)
-    matrix = derivative(covariance, apart, 0) + np.diag(noise)
-    value, first, second = (derivative(covariance, distance**2, order) for order in range(3))
+    matrix = derivative(given, apart, 0) + np.diag(noise)
+    value, first, second = (derivative(given, distance**2, order) for order in range(3))
     if sited:
         value = np.arange(len(places)) == 0
     right = [value, *(-2 * first * places[:, axis] for axis in range(3)),
@@ -38,8 +38,8 @@ def _weights(places, support, covariance, sited):
     return weights - np.outer(ones, (weights.sum(0) - sums) / ones.sum()) if len(places) else weights
 
 
-def derivative(covariance, square, order):
+def derivative(given, square, order):
     """Derivative of C as a function of r^2."""
-    rates = [covariance.slowest * 2**m for m in range(len(covariance.amplitudes))]
-    return sum(amplitude * (-rate) ** order * np.exp(-rate * square)
-               for rate, amplitude in zip(rates, covariance.amplitudes))
+    slowest, amplitudes = given
+    return sum(amplitude * (-slowest * 2**m) ** order * np.exp(-slowest * 2**m * square)
+               for m, amplitude in enumerate(amplitudes))

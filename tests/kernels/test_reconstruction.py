@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from eddies.flow.tracers import release
-from eddies.kernels.reconstruction import GridPlanes, sums_on_grid, kernel_numbers
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.exchanges import with_ghosts
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.reconstruction import reconstruct_with_gradient
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, WendlandC2
@@ -38,20 +38,19 @@ def averages(field, kernel):
 def averages_by_torch(field, kernel):
     at_points, at_particles = (field._neighbors_of(points).pairs(points, field._position, dtype=field.dtype)
                                for points in (field.points, field.owned))
-    volume = field._with_ghosts(1 / at_particles.sum(kernel.value(at_particles.distance)))
+    volume = with_ghosts(field.halo, 1 / at_particles.sum(kernel.value(at_particles.distance)))
     on_grid, on_particles = (reconstruct_with_gradient(kernel, pairs, volume, field._velocity)
                              for pairs in (at_points, at_particles))
     return [volume, on_grid[0], *on_grid, *on_particles]
 
 
-@pytest.mark.mpi(1, 2, 3)
-@pytest.mark.parametrize("neighbors", [60, 3])
-@pytest.mark.parametrize("dtype, rounding", [(torch.float64, 1e-11), (torch.float32, 2e-4)])
-@pytest.mark.parametrize("kind", KERNELS)
+@pytest.mark.mpi(1, 3)
+@pytest.mark.parametrize("kind, dtype, rounding, neighbors", [
+    ("cubic spline", torch.float64, 1e-11, 60), ("wendland", torch.float32, 2e-4, 60),
+    ("tabulated", torch.float64, 1e-11, 60), ("tabulated", torch.float32, 2e-4, 60),
+    ("wendland", torch.float64, 1e-11, 3)])
 def test_averages_are_those_of_torch(comm, library, monkeypatch, kind, dtype, rounding, neighbors):
     """Also with so few neighbours that some points have none, and gradients are quotients of small numbers."""
-    if neighbors == 3 and dtype == torch.float32:
-        pytest.skip("of one neighbour at the very edge of the kernel single precision tells nothing")
     slab = SlabDecomposition(comm, LENGTH, 15)
     position = torch.from_numpy(release(slab, 3, 12, "random")["position"])
     support = LENGTH / 12 * (neighbors / (4 / 3 * np.pi)) ** (1 / 3)
@@ -60,13 +59,6 @@ def test_averages_are_those_of_torch(comm, library, monkeypatch, kind, dtype, ro
         kernel = KERNELS[kind](support)
     monkeypatch.setattr("eddies.particles.pairs.library", lambda: library)
     monkeypatch.setattr("eddies.particles.particle_field.library", lambda: library)
-    found, expected = averages(field, kernel), averages_by_torch(field, kernel)
-    for one, other in zip(found, expected, strict=True):
+    for one, other in zip(averages(field, kernel), averages_by_torch(field, kernel), strict=True):
         assert one.shape == other.shape
         assert (one - other).abs().max() <= rounding * other.abs().max() > 0
-
-
-def test_wrong_columns_are_refused(library):
-    with pytest.raises(ValueError, match="four are needed"):
-        sums_on_grid(library, GridPlanes(8, 0.1, 0, 8, True), kernel_numbers(0.2, np.ones((1, 4))), np.zeros((5, 3)),
-                     np.zeros((5, 3)))

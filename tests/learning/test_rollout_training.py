@@ -31,7 +31,7 @@ def resolution(slab):
 def solving(resolved, iterations):
     """Let each solve take so many iterations; None: until its residual is below the error of differences of losses."""
     resolved.iterations = iterations
-    resolved.tolerance = resolved.tolerance_foreseen = resolved.tolerance_adjoint = 1e-10
+    resolved.tolerance = resolved.tolerance_predicted = resolved.tolerance_adjoint = 1e-10
     return resolved
 
 

@@ -12,12 +12,9 @@ LENGTH = 2 * np.pi
 WIDTH = 0.8
 
 
-@pytest.mark.parametrize("total, parts", [(10, 3), (2, 3), (0, 2), (7, 7)])
-def test_blocks_are_contiguous_complete_and_differ_by_at_most_one(total, parts):
-    starts = block_starts(total, parts)
-    sizes = np.diff(starts)
-    assert starts[0] == 0 and starts[-1] == total
-    assert sizes.max() - sizes.min() <= 1
+def test_blocks_differ_by_at_most_one():
+    for total, parts, starts in ((10, 3, [0, 4, 7, 10]), (2, 3, [0, 1, 2, 2]), (0, 2, [0, 0, 0])):
+        assert block_starts(total, parts).tolist() == starts
 
 
 @pytest.mark.mpi(1, 3)
@@ -38,22 +35,21 @@ def slab_particles(comm, total=300, squeeze=1.0):
     return slab, migrate(slab, {"id": np.arange(total)[own], "position": position[own]}), position
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(2, 3)
 @pytest.mark.parametrize("squeeze", [1.0, 0.2], ids=["everywhere", "on one rank"])
 def test_ghosts_are_exactly_the_images_within_the_width(comm, squeeze):
     slab, particles, position = slab_particles(comm, squeeze=squeeze)
     halo = HaloExchange(slab, particles["position"], WIDTH)
     expected = []
-    if comm.size > 1:
-        for shift in (-LENGTH, 0.0, LENGTH):
-            z = position[:, 2] + shift
-            near = ((z >= slab.lower - WIDTH) & (z < slab.lower)) | ((z >= slab.upper) & (z < slab.upper + WIDTH))
-            expected += [(i, z[i]) for i in np.flatnonzero(near)]
-    found = zip(halo.forward(particles["id"]), halo.forward_positions(particles["position"])[:, 2])
-    assert np.allclose(sorted(found), sorted(expected), atol=1e-12) if expected else halo.count == 0
+    for shift in (-LENGTH, 0.0, LENGTH):
+        z = position[:, 2] + shift
+        near = ((z >= slab.lower - WIDTH) & (z < slab.lower)) | ((z >= slab.upper) & (z < slab.upper + WIDTH))
+        expected += [(i, z[i]) for i in np.flatnonzero(near)]
+    ghosts = zip(halo.forward(particles["id"]), halo.forward_positions(particles["position"])[:, 2])
+    assert halo.count == len(expected) and np.allclose(sorted(ghosts), sorted(expected), atol=1e-12)
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(2, 3)
 @pytest.mark.parametrize("squeeze, width", [(0.2, WIDTH), (1.0, 4.9 * LENGTH / 17)],
                          ids=["on one rank", "seen from both sides"])
 def test_adjoint_identity(comm, squeeze, width):
@@ -83,8 +79,8 @@ def test_adjoint_of_ghost_planes_is_the_transpose(comm):
     for part in parts:
         part[...] = random.standard_normal(part.shape)
     forward = sum(np.sum(part * weight) for part, weight in zip(halo.forward(planes), parts))
-    found, expected = global_sum(comm, np.array([forward, np.sum(planes * halo.adjoint(parts))]))
-    assert found == pytest.approx(expected, rel=1e-12)
+    left, right = global_sum(comm, np.array([forward, np.sum(planes * halo.adjoint(parts))]))
+    assert left == pytest.approx(right, rel=1e-12)
 
 
 @pytest.mark.mpi(3)

@@ -1,7 +1,6 @@
 """Configurations of particles, models and helpers for the tests of particles."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -52,7 +51,7 @@ PAIR_MODELS = {
 #: Models with a resolved velocity.
 RESOLVED_MODELS = {
     "pressure": {"pressure": {}, "pairs": {}},
-    "told densities": {**PRESETS["resolved"], "pairs": {}},
+    "pairs with density": {**PRESETS["resolved"], "pairs": {}},
     **{name: PRESETS[name] for name in ("resolved + pairs", "resolved")},
 }
 MODELS = PAIR_MODELS | RESOLVED_MODELS
@@ -93,42 +92,32 @@ def _settings(kind, chosen):
     return kind(**{**small, **chosen})
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReadsNothing(TermSettings):
-    """Settings of a term without inputs."""
+def declared(reads=(), gives=("acceleration",)):
+    """Settings of a term with these inputs and contributions."""
+    return type("Settings", (TermSettings,), {"reads": reads, "gives": gives})()
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReadsDensity(TermSettings):
-    """Settings of a term that reads the density."""
+class Given(Term):
+    """A term whose rates are a function of the context."""
 
-    reads = ("density",)
-
-
-class DensityReader(Term):
-    """A term that reads the density and contributes nothing."""
-
-    Settings = ReadsDensity
-
-    def __init__(self):
-        super().__init__(ReadsDensity(), FLOW)
-
-    def forward(self, context):
-        assert context.density.shape == (len(context.particles),)
-        return Rates()
-
-
-class Field(Term):
-    """An acceleration, a `function` of position and velocity."""
-
-    Settings = ReadsNothing
-
-    def __init__(self, function):
-        super().__init__(ReadsNothing(), FLOW)
+    def __init__(self, function, reads=(), gives=("acceleration",)):
+        super().__init__(declared(reads, gives), FLOW)
         self.function = function
 
     def forward(self, context):
-        return Rates(acceleration=self.function(context.particles.position, context.particles.velocity))
+        return self.function(context)
+
+
+class Field(Given):
+    """A term whose acceleration is a function of position and velocity."""
+
+    def __init__(self, acceleration):
+        super().__init__(lambda context: Rates(acceleration(context.particles.position, context.particles.velocity)))
+
+
+def density_reader():
+    """A term that reads the density and contributes nothing."""
+    return Given(lambda context: Rates(), reads=("density",))
 
 
 def of_terms(*terms, flow=FLOW):
@@ -143,7 +132,7 @@ def dynamics_of(slab, lagrangian, skin=0.2, iterations=None, tolerance=None, **o
         resolution = dynamics.resolution
         resolution.iterations = iterations
         if tolerance is not None:
-            resolution.tolerance = resolution.tolerance_foreseen = resolution.tolerance_adjoint = tolerance
+            resolution.tolerance = resolution.tolerance_predicted = resolution.tolerance_adjoint = tolerance
     return dynamics
 
 
@@ -217,6 +206,6 @@ def along(function, inputs, direction, step):
     return (ends[0] - ends[1]) / (2 * step)
 
 
-def relative(found, exact):
+def relative(values, exact):
     """Relative L2 error."""
-    return float(np.linalg.norm(found - exact) / np.linalg.norm(exact))
+    return float(np.linalg.norm(values - exact) / np.linalg.norm(exact))

@@ -2,7 +2,6 @@
 
 import gc
 import weakref
-from dataclasses import dataclass
 
 import pytest
 import torch
@@ -10,10 +9,10 @@ import torch
 from eddies.particles import context as context_module
 from eddies.particles.rates import Rates
 from eddies.particles.resolved_velocity import ResolvedVelocity
-from eddies.particles.terms.term import PairTerm, Term
-from eddies.scene.terms import PRESETS, TermError, TermSettings
+from eddies.particles.terms.term import PairTerm
+from eddies.scene.terms import PRESETS, TermError
 from tests.particles.configurations import (
-    MODELS, ReadsNothing, alone, distributed, dynamics_of, model, of_terms, state,
+    FLOW, MODELS, Given, alone, declared, distributed, dynamics_of, model, of_terms, state,
 )
 
 
@@ -42,7 +41,7 @@ def test_terms_share_pairs_and_the_resolved_velocity(comm, monkeypatch):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("terms", [*MODELS.values(), PRESETS["local"]], ids=[*MODELS, "local"])
+@pytest.mark.parametrize("terms", [MODELS["published"], MODELS["pairs with density"], PRESETS["local"]])
 def test_an_evaluation_leaves_no_reference_cycle(comm, monkeypatch, terms):
     """Lists and weights are most of a run's memory: it must be free without garbage collection."""
     slab, particles = distributed(comm, *state())
@@ -65,50 +64,21 @@ def test_an_evaluation_leaves_no_reference_cycle(comm, monkeypatch, terms):
         gc.enable()
 
 
-class Undeclared(Term):
-    """Uses an input that it does not declare."""
-
-    Settings = ReadsNothing
-
-    def __init__(self, name, settings=None):
-        super().__init__(settings or ReadsNothing(), of_terms().flow)
-        self.name = name
-
-    def forward(self, context):
-        if self.name == "resolved":
-            return Rates(acceleration=context.resolved.missing())
-        return Rates(acceleration=context.local.position if self.name == "pairs" else context.column(self.name))
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReadsPairs(TermSettings):
-    """Settings of a term that reads pairs, but no density."""
-
-    reads = ("pairs",)
-
-
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("name, settings, wanted", [
-    ("pairs", None, "pairs"), ("velocity", None, "pairs"), ("density", ReadsPairs(), "density"),
-    ("resolved", ReadsPairs(), "resolved")])
-def test_an_undeclared_input_is_named(comm, name, settings, wanted):
+@pytest.mark.parametrize("used, reads, missing", [
+    (lambda context: context.local.position, (), "pairs"),
+    (lambda context: context.column("velocity"), (), "pairs"),
+    (lambda context: context.column("density"), ("pairs",), "density"),
+    (lambda context: context.resolved.missing(), ("pairs",), "resolved")])
+def test_an_undeclared_input_is_named(comm, used, reads, missing):
     slab, particles = alone(*state()[:2])
-    with pytest.raises(TermError, match=f'"{wanted}".*`reads`'):
-        dynamics_of(slab, of_terms(Undeclared(name, settings))).rates(particles)
-
-
-@dataclass(frozen=True, kw_only=True)
-class GivesDensity(TermSettings):
-    """Settings of a sum over pairs that gives a part of the density."""
-
-    reads = ("pairs",)
-    gives = ("density",)
+    with pytest.raises(TermError, match=f'"{missing}".*`reads`'):
+        dynamics_of(slab, of_terms(Given(used, reads))).rates(particles)
 
 
 class WeightedMean(PairTerm):
     """A density from a sum over pairs and the moments of the neighbourhoods."""
 
-    Settings = GivesDensity
     needs_moments = True
 
     def pair_values(self, pairs):
@@ -122,7 +92,7 @@ class WeightedMean(PairTerm):
 def test_a_density_is_summed_for_all_particles_if_rates_are_for_some(comm):
     """Density and rates of some particles both need moments."""
     slab, particles = distributed(comm, *state())
-    giving = WeightedMean(GivesDensity(), of_terms().flow).double()
+    giving = WeightedMean(declared(("pairs",), ("density",)), FLOW).double()
     lagrangian = of_terms(giving, *model(pairs={}, eddy_viscosity={}).terms.values())
     rows = torch.arange(0, len(particles), 3)
     whole = dynamics_of(slab, lagrangian).rates(particles)

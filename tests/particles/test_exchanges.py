@@ -4,34 +4,22 @@ import torch
 
 from eddies.parallel.halo import HaloExchange
 from eddies.parallel.reduction import global_sum
-from eddies.particles.exchanges import exchange_ghost_positions, exchange_ghosts
-from tests.particles.configurations import LENGTH, distributed, state
+from eddies.particles.exchanges import with_ghosts
+from tests.particles.configurations import distributed, state
 
 
 @pytest.mark.mpi(1, 2, 3)
-@pytest.mark.parametrize("kind", ["even", "void"])
-@pytest.mark.parametrize("exchange", [exchange_ghosts, exchange_ghost_positions])
-def test_backward_is_the_adjoint_of_forward(comm, kind, exchange):
-    slab, particles = distributed(comm, *state(kind=kind))
+@pytest.mark.parametrize("positions", [False, True])
+def test_backward_is_the_adjoint_of_forward(comm, positions):
+    slab, particles = distributed(comm, *state(kind="uneven"))
     halo = HaloExchange(slab, particles.position.numpy(), 1.7)
     random = torch.manual_seed(comm.rank)
     position = particles.position.clone().requires_grad_()
-    ghosts = exchange(halo, position)
-    weight = torch.randn(ghosts.shape, dtype=torch.float64, generator=random)
-    (gradient,) = torch.autograd.grad((weight * ghosts).sum(), position)
+    rows = with_ghosts(halo, position, positions)
+    weight = torch.randn(rows.shape, dtype=torch.float64, generator=random)
+    (gradient,) = torch.autograd.grad((weight * rows).sum(), position)
     moved = torch.randn(position.shape, dtype=torch.float64, generator=random)
     with torch.no_grad():
-        forwards = (weight * (exchange(halo, position + moved) - ghosts)).sum().item()
+        forwards = (weight * (with_ghosts(halo, position + moved, positions) - rows)).sum().item()
     both = global_sum(comm, np.array([forwards, (gradient * moved).sum().item()]))
     assert both[0] == pytest.approx(both[1], rel=1e-12, abs=1e-12)
-
-
-@pytest.mark.mpi(2, 3)
-def test_ghosts_lie_within_the_width_of_the_slab(comm):
-    slab, particles = distributed(comm, *state())
-    halo = HaloExchange(slab, particles.position.numpy(), 1.0)
-    z = exchange_ghost_positions(halo, particles.position)[:, 2]
-    assert halo.count == len(z) > 0
-    assert torch.all((z >= slab.lower - 1.0) & (z < slab.upper + 1.0))
-    assert torch.all((z < slab.lower) | (z >= slab.upper))
-    assert float(exchange_ghosts(halo, particles.position)[:, 2].max()) < LENGTH

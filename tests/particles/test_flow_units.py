@@ -3,13 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eddies.particles.flow_units import FlowUnits, ReferenceScales, measured_scales
+from eddies.particles.flow_units import FlowUnits, measured_scales
 from eddies.scene.terms import TermError
 from tests.particles.configurations import CUTOFF, NEIGHBORS, SCALES, model
-
-
-def test_scales_survive_a_dictionary():
-    assert ReferenceScales(**SCALES.to_dict()) == SCALES
 
 
 @pytest.mark.mpi(1, 2)

@@ -1,4 +1,4 @@
-"""The steps between particles, grid and modes have their adjoints, and formulas agree with plain transforms."""
+"""The steps between particles, grid and modes have their adjoints, and formulas of them their gradients."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,6 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.fourier_grid import FourierGrid
 
 LENGTH, CELLS, RESOLVED = 5.0, 13, 5  # slabs of unequal thickness on two and three ranks
-PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def grid_on(comm, cells=CELLS, resolved=RESOLVED):
@@ -49,11 +48,11 @@ def pulled_back(function, argument, weights):
 
 def assert_adjoint(comm, function, argument, weights):
     """<F x, y> = <x, F* y> for a linear function."""
-    found = inner(comm, function(argument), weights)
-    expected = inner(comm, argument, pulled_back(function, argument, weights))
+    forward = inner(comm, function(argument), weights)
+    backward = inner(comm, argument, pulled_back(function, argument, weights))
     size = np.sqrt(inner(comm, function(argument), function(argument)) * inner(comm, weights, weights))
-    assert found == pytest.approx(expected, abs=1e-13 * size)
-    assert abs(found) > 1e-8 * size  # not zero on both sides
+    assert forward == pytest.approx(backward, abs=1e-13 * size)
+    assert abs(forward) > 1e-8 * size  # not zero on both sides
 
 
 def assert_slope(comm, function, argument, weights, step=1e-5, error=1e-6):
@@ -66,7 +65,7 @@ def assert_slope(comm, function, argument, weights, step=1e-5, error=1e-6):
 
 
 @pytest.mark.mpi(1, 2, 3)
-@pytest.mark.parametrize("cells, resolved", [(13, 5), (12, 5), (9, 4)])
+@pytest.mark.parametrize("cells, resolved", [(13, 5), (12, 5)])
 def test_adjoints_of_the_transforms(comm, cells, resolved):
     grid = grid_on(comm, cells, resolved)
     fields, modes = real(comm, 2, *grid.spectral.physical_shape), modes_like(comm, grid, 2)
@@ -120,80 +119,3 @@ def test_squares_are_products_and_their_gradient(comm):
     back = [pulled_back(function, modes, weights) for function in (grid.squares, products)]
     torch.testing.assert_close(*back, rtol=0, atol=1e-10 * float(back[1].abs().max()))
     assert_slope(comm, grid.squares, modes, weights, step=1e-3, error=1e-9)  # a difference of squares is exact
-
-
-# ---- against numpy, on one array of the whole box
-
-
-class Whole:
-    """Fields of the whole box (c, z, y, x) with plain transforms, the same on all ranks."""
-
-    def __init__(self, cells=CELLS):
-        k = np.fft.fftfreq(cells, 1 / cells) * (2 * np.pi / LENGTH)
-        self.wave = np.stack(np.meshgrid(k, k, k, indexing="ij")[::-1])
-        self.squared = (self.wave**2).sum(0)
-        self.inverse = np.divide(1, self.squared, out=np.zeros_like(self.squared), where=self.squared > 0)
-
-    def modes(self, fields):
-        return np.fft.fftn(fields, axes=(-3, -2, -1))
-
-    def fields(self, modes):
-        return np.fft.ifftn(modes, axes=(-3, -2, -1)).real
-
-    def cut(self, fields, highest=RESOLVED):
-        """The part with |k_i| <= highest."""
-        kept = (np.abs(self.wave) <= (highest + 0.5) * 2 * np.pi / LENGTH).all(0)
-        return self.fields(kept * self.modes(fields))
-
-    def random(self, components, seed=5, highest=RESOLVED):
-        return self.cut(np.random.default_rng(seed).standard_normal((components, *self.squared.shape)), highest)
-
-
-def own(grid, whole):
-    """This rank's planes of fields (..., z, y, x) of the whole box."""
-    planes = slice(grid.decomposition.start, grid.decomposition.stop)
-    return torch.from_numpy(np.ascontiguousarray(whole[..., planes, :, :]))
-
-
-def assert_fields(grid, found, expected):
-    """Modes, or fields, against fields of the whole box."""
-    if found.is_complex():
-        found = grid.to_fields(found if found.dim() == 4 else found[None])
-    expected = own(grid, expected if expected.ndim > 3 else expected[None]).numpy()
-    assert np.allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max(initial=0.1))
-
-
-MATRIX = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])  # places of xx, yy, zz, xy, xz, yz
-
-
-@pytest.mark.mpi(1, 2, 3)
-def test_derivatives_projection_and_pressure_are_those_of_plain_transforms(comm):
-    grid, whole = grid_on(comm), Whole()
-    vector, stress = whole.random(3), whole.random(6, seed=6)
-    modes, spectral = grid.to_modes(own(grid, vector)), whole.modes(vector)
-    assert_fields(grid, grid.gradient(modes[0]), whole.fields(1j * whole.wave * spectral[0]))
-    assert_fields(grid, grid.divergence(modes), whole.fields(1j * (whole.wave * spectral).sum(0)))
-    along = (whole.wave * spectral).sum(0) * whole.inverse
-    assert_fields(grid, grid.solenoidal(modes), whole.fields(spectral - whole.wave * along))
-    assert_fields(grid, grid.slopes(modes), np.stack([whole.fields(1j * whole.wave * each) for each in spectral]))
-    tau = whole.modes(stress)[MATRIX]
-    divergence = (1j * whole.wave[None] * tau).sum(1)
-    pressure = (1j * whole.wave * divergence).sum(0) * whole.inverse
-    stress_modes = grid.to_modes(own(grid, stress))
-    assert_fields(grid, grid.stress_divergence(stress_modes), whole.fields(divergence))
-    hidden = grid.hidden_stress(stress_modes)
-    assert_fields(grid, hidden.pressure_modes, whole.fields(pressure))
-    assert_fields(grid, hidden.force_modes, whole.fields(-1j * whole.wave * pressure - divergence))
-    kept = whole.squared <= (RESOLVED * 2 * np.pi / LENGTH) ** 2 * (1 + 1e-9)
-    assert_fields(grid, grid.within(modes), whole.fields(kept * spectral))
-
-
-@pytest.mark.mpi(1, 2, 3)
-def test_products_of_fields_at_the_grid_points(comm):
-    cells = 18  # products of modes up to 4 are free of aliasing
-    grid, whole = grid_on(comm, cells, 4), Whole(cells)
-    first, second = whole.random(3, highest=4), whole.random(3, seed=8, highest=4)
-    both = torch.stack([own(grid, first), own(grid, second)], dim=1)  # the second index is summed over
-    for fields, parts in ((own(grid, first), (first,)), (both, (first, second))):
-        expected = [whole.cut(sum(part[i] * part[j] for part in parts), 4) for i, j in PAIRS]
-        assert_fields(grid, grid.products(fields, fields), np.stack(expected))

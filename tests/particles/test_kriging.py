@@ -27,7 +27,7 @@ def kriging(comm, field, dtype=torch.float64):
     return dynamics.context(particles).kriging, particles
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
 def test_derivatives_of_a_field_of_few_modes(comm, dtype):
     """Waves of seven spacings and more."""

@@ -1,7 +1,6 @@
 """A model is a list of terms: inputs, contributions, stored linear terms, and errors."""
 
 import json
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -12,9 +11,9 @@ from eddies.parallel.reduction import sum_flat
 from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.rates import Rates
 from eddies.particles.terms.term import PairTerm, Term
-from eddies.scene.terms import TERMS, TermError, TermSettings
+from eddies.scene.terms import TERMS, TermError
 from tests.particles.configurations import (
-    FLOW, MODELS, PAIR_MODELS, Field, ReadsNothing, distributed, dynamics_of, given, model, of_terms, state,
+    FLOW, MODELS, PAIR_MODELS, Given, declared, distributed, dynamics_of, given, model, of_terms, state,
 )
 
 
@@ -31,19 +30,15 @@ LINEAR = ["pressure", "stress", "damping", "relaxation", "injection", "viscosity
 SETTINGS = {"injection": dict(injection_rate=0.3)}
 
 
-def assert_same_rates(found, expected, tolerance=1e-12):
-    found, expected = given(found), given(expected)
-    assert found.keys() == expected.keys()
+def assert_same_rates(actual, expected):
+    actual, expected = given(actual), given(expected)
+    assert actual.keys() == expected.keys()
     for name, values in expected.items():
-        assert (found[name] - values).abs().max() <= tolerance * max(float(values.detach().abs().max()), 1e-300), name
+        assert (actual[name] - values).abs().max() <= 1e-12 * max(float(values.detach().abs().max()), 1e-300), name
 
 
 class LinearPairs(PairTerm):
     """A user's linear sum over pairs: the parameter is within the sum."""
-
-    @dataclass(frozen=True, kw_only=True)
-    class Settings(TermSettings):
-        reads = ("pairs",)
 
     parity, linear = -torch.ones(3), True
 
@@ -59,46 +54,31 @@ class LinearPairs(PairTerm):
 
 
 @pytest.mark.mpi(1, 2)
-def test_stored_linear_terms_give_their_rates_at_any_parameters(comm):
-    """Rates of all particles and of some rows, with a user's sum over pairs among the terms."""
+def test_stored_linear_terms_give_their_rates_and_gradients_at_any_parameters(comm):
+    """For all particles and for some rows, with a user's sum over pairs and a network that reads the density."""
     slab, particles = distributed(comm, *state())
     linear = model({word: SETTINGS.get(word, {}) for word in LINEAR})
-    pairs = build_model({"LinearPairs": LinearPairs.Settings()}, [f"{__name__}:LinearPairs"], FLOW)
-    lagrangian = LagrangianModel({**linear.terms, **pairs.terms, **model(PAIR_MODELS["paper"]).terms}, FLOW)
+    pairs = build_model({"LinearPairs": declared(("pairs",))}, [f"{__name__}:LinearPairs"], FLOW)
+    lagrangian = LagrangianModel({**linear.terms, **pairs.terms, **model(pairs={}).terms}, FLOW)
     dynamics = dynamics_of(slab, lagrangian)
     kept = lagrangian.linear_rates(dynamics.context(particles))
     assert set(kept) == {*LINEAR, "LinearPairs"}
-    for seed in (1, 2):
+    for seed, rows in ((1, None), (2, torch.tensor([7, 3, 3, 12]))):
         randomised(lagrangian, seed)
-        for rows in (None, torch.tensor([7, 3, 3, 12])):
-            direct = dynamics.rates(particles, rows)
-            assert_same_rates(dynamics.rates(particles, rows, kept), direct)
-            assert len(direct.acceleration) == (len(particles) if rows is None else 4)
-
-
-@pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("name", ["resolved + pairs", "told densities", "resolved"])
-def test_rates_and_gradients_with_stored_terms_are_those_without(comm, name):
-    slab, particles = distributed(comm, *state())
-    lagrangian = model({**MODELS[name], **SETTINGS})
-    dynamics = dynamics_of(slab, lagrangian)
-    kept = lagrangian.linear_rates(dynamics.context(particles))
-    assert set(kept) == set(lagrangian.terms) - {"pairs"}
-    randomised(lagrangian)
-    rows, found = torch.tensor([2, 31, 5]), []
-    density = dynamics.rates(particles, kept=kept).density
-    for chosen in ({}, {"kept": kept}):
-        rates = dynamics.rates(particles, rows, **chosen)
-        loss = rates.acceleration.square().sum() + (0 if rates.density is None else 100 * rates.density.sum())
-        parameters = list(lagrangian.parameters())
-        gradients = [part.numpy().copy() for part in torch.autograd.grad(loss, parameters, materialize_grads=True)]
-        sum_flat(comm, gradients)
-        found.append((rates, gradients))
-    assert_same_rates(found[1][0], found[0][0])
-    for kept_gradient, gradient in zip(found[1][1], found[0][1]):
-        assert np.abs(kept_gradient - gradient).max() <= 1e-11 * max(np.abs(gradient).max(), 1e-10)
-    if density is not None:  # training computes the density once
-        assert_same_rates(dynamics.rates(particles, rows, kept, density.detach()), found[0][0])
+        results = []
+        for chosen in ({}, {"kept": kept}):
+            rates = dynamics.rates(particles, rows, **chosen)
+            loss = rates.acceleration.square().sum() + 100 * rates.density.sum()
+            gradients = torch.autograd.grad(loss, list(lagrangian.parameters()), materialize_grads=True)
+            gradients = [part.numpy().copy() for part in gradients]
+            sum_flat(comm, gradients)
+            results.append((rates, gradients))
+        (direct, expected), (stored, gradients) = results
+        assert_same_rates(stored, direct)
+        for gradient, reference in zip(gradients, expected):
+            assert np.abs(gradient - reference).max() <= 1e-11 * max(np.abs(reference).max(), 1e-10)
+    # Training computes the density once.
+    assert_same_rates(dynamics.rates(particles, rows, kept, stored.density.detach()), direct)
 
 
 class Quadratic(Term):
@@ -107,23 +87,20 @@ class Quadratic(Term):
     linear = True
 
     def __init__(self):
-        super().__init__(ReadsNothing(), FLOW)
+        super().__init__(declared(), FLOW)
         self.factor = torch.nn.Parameter(torch.ones((), dtype=torch.float64))
 
     def forward(self, context):
         return Rates(acceleration=self.factor**2 * context.particles.velocity)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_term_that_is_not_linear_is_named(comm):
     slab, particles = distributed(comm, *state())
-    for terms, wrong in ((model(damping={}, relaxation={}), False), (of_terms(Quadratic()), True)):
-        context = dynamics_of(slab, terms).context(particles)
-        if wrong:
-            with pytest.raises(TermError, match="Quadratic.*linear"):
-                terms.require_linear(context)
-        else:
-            terms.require_linear(context)
+    linear, quadratic = model(damping={}, relaxation={}), of_terms(Quadratic())
+    linear.require_linear(dynamics_of(slab, linear).context(particles))
+    with pytest.raises(TermError, match="Quadratic.*linear"):
+        quadratic.require_linear(dynamics_of(slab, quadratic).context(particles))
 
 
 @pytest.mark.mpi(1, 2)
@@ -161,44 +138,29 @@ def test_inputs_and_contributions_of_a_model_are_those_of_its_terms():
 @pytest.mark.parametrize("word", TERMS)
 def test_every_parameter_is_reported_as_a_coefficient(word):
     """A network reports its number of weights. A coefficient whose magnitude counts is not negative."""
-    found = model({word: {"diffusion": 0.1} if word == "continuity" else {}})
+    lagrangian = model({word: {"diffusion": 0.1} if word == "continuity" else {}})
     with torch.no_grad():
-        for parameter in found.parameters():
+        for parameter in lagrangian.parameters():
             parameter.neg_()
-    reported = found.learned_coefficients.get(word, [])
+    reported = lagrangian.learned_coefficients.get(word, [])
     count = sum(each["learned"] if each["name"] == "weights" else np.size(each["learned"]) for each in reported)
-    assert count == sum(parameter.numel() for parameter in found.parameters())
+    assert count == sum(parameter.numel() for parameter in lagrangian.parameters())
     assert all(each["unit"] and each["meaning"] for each in reported)
     assert all(each["learned"] >= 0 and each["value"] >= 0 for each in reported if each["name"].startswith("|"))
     assert json.loads(json.dumps(reported)) == reported
 
 
-@dataclass(frozen=True, kw_only=True)
-class Both(TermSettings):
-    """Settings of a term that reads the density and gives a part of it."""
-
-    reads = gives = ("density",)
-
-
-def test_a_term_cannot_read_the_density_and_give_it():
-    with pytest.raises(TermError, match="density"):
-        of_terms(Term(Both(), FLOW))
-
-
-class NotRates(Field):
-    """Returns a tensor."""
-
-    def forward(self, context):
-        return context.particles.velocity
-
-
 @pytest.mark.mpi(1)
-def test_a_term_that_does_not_return_rates_is_named(comm):
+def test_a_term_that_contradicts_its_declaration_is_named(comm):
     slab, particles = distributed(comm, *state())
-    with pytest.raises(TermError, match="NotRates"):
-        dynamics_of(slab, of_terms(NotRates(None))).rates(particles)
+    with pytest.raises(TermError, match="density"):
+        of_terms(Given(None, reads=("density",), gives=("density",)))
+    for function, gives in ((lambda context: context.particles.velocity, ("acceleration",)),
+                            (lambda context: Rates(), ("density",))):
+        with pytest.raises(TermError, match="Given"):
+            dynamics_of(slab, of_terms(Given(function, gives=gives))).rates(particles)
     with pytest.raises(NotImplementedError, match="Term has no forward"):
-        dynamics_of(slab, of_terms(Term(ReadsNothing(), FLOW))).rates(particles)
+        dynamics_of(slab, of_terms(Term(declared(), FLOW))).rates(particles)
 
 
 class NoTerm:
@@ -213,9 +175,9 @@ class NeedsMore(Term):
 
 
 @pytest.mark.parametrize("name, settings, kind, complaint", [
-    ("NoTerm", ReadsNothing(), TermError, "derived from eddies.Term"),
-    ("Nothing", ReadsNothing(), ImportPathError, "Nothing"),
-    ("NeedsMore", ReadsNothing(), TermError, "NeedsMore.*cannot be made"),
+    ("NoTerm", declared(), TermError, "derived from eddies.Term"),
+    ("Nothing", declared(), ImportPathError, "Nothing"),
+    ("NeedsMore", declared(), TermError, "NeedsMore.*cannot be made"),
     ("Term", object(), TermError, "eddies.TermSettings"),
 ])
 def test_a_class_that_cannot_be_a_term_is_refused(name, settings, kind, complaint):

@@ -30,7 +30,7 @@ def largest(array):
 
 
 @pytest.mark.mpi(1, 2, 3)
-@pytest.mark.parametrize("cells, precision", [(7, "float64"), (8, "float32"), (15, "float64"), (48, "float32")])
+@pytest.mark.parametrize("cells, precision", [(15, "float64"), (48, "float32")])
 def test_forward_and_backward_against_numpy(comm, cells, precision):
     grid = make_grid(comm, cells, precision)
     whole, own = noise(grid, 3)
@@ -47,12 +47,11 @@ def test_forward_and_backward_against_numpy(comm, cells, precision):
 
 
 @pytest.mark.mpi(2)
-@pytest.mark.parametrize("precision", ["float64", "float32"])
-@pytest.mark.parametrize("cells", [48, 120, 128])
+@pytest.mark.parametrize("cells, precision", [(48, "float32"), (128, "float64")])
 def test_lines_that_are_transformed_across_do_not_crowd_a_cache(comm, cells, precision):
     grid = make_grid(comm, cells, precision)
     columns = [grid.column_pass.plan("FORWARD", rows).plan for rows in grid.column_pass.rows(grid.spectral_shape[1])]
-    along_y = grid.plane_pass.plans("FORWARD", 1, 1).plans[0][1:]
+    along_y = grid.plane_pass.plans("FORWARD", 1, slice(0, 2)).plans[0][1:]
     for plan, axis in [*((plan, 0) for plan in columns), *((plan, 1) for plan in along_y)]:
         for array in (plan.input_array, plan.output_array):
             # 512 bytes are eight lines of a cache of 64 sets.
@@ -105,22 +104,6 @@ def test_earlier_contents_of_the_memory_of_a_transform_do_not_show(comm):
     assert np.array_equal(grid.backward(first), grid.backward(first))
 
 
-@pytest.mark.mpi(1, 2, 3)
-@pytest.mark.parametrize("cells", [8, 15])
-def test_blocks_have_the_values_at_all_grid_points_once(comm, cells):
-    grid = make_grid(comm, cells)
-    modes = grid.forward(noise(grid, 3)[1])
-    slopes = [grid.backward(1j * k * modes) for k in grid.wavevector]
-    expected = np.concatenate([*slopes, grid.backward(modes)]).reshape(12, -1)
-
-    def expand(packed):
-        return [(grid.d_dx, packed[:3]), grid.d_dy * packed[:3], packed[3:], packed[:3]]
-
-    found = [values.reshape(12, -1).copy() for values in grid.blocks(modes, 12, expand, z_derivatives=3)]
-    found = np.concatenate([np.zeros((12, 0)), *found], axis=1)
-    assert largest(np.sort(found) - np.sort(expected)) < 1e-13
-
-
 @pytest.mark.mpi(1, 3)
 @pytest.mark.parametrize("cells", [7, 8])
 def test_a_product_of_fields_is_that_at_the_grid_points(comm, cells):
@@ -131,7 +114,7 @@ def test_a_product_of_fields_is_that_at_the_grid_points(comm, cells):
         out[0] = fields[0] / (2 + fields[1] ** 2)
 
     first, second = grid.backward(modes)
-    found = grid.multiply(modes, ratio, 1, fields=2)
-    assert largest(found - grid.forward((first / (2 + second**2))[None])) < 1e-14
+    quotient = grid.multiply(modes, ratio, 1, fields=2)
+    assert largest(quotient - grid.forward((first / (2 + second**2))[None])) < 1e-14
     second_moments = grid.squares(np.concatenate([modes, modes[:1]]))
     assert largest(second_moments[3] - grid.forward((first * second)[None])[0]) < 1e-14

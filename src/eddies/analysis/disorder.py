@@ -7,11 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from eddies.analysis.lagrangian import evenly, minimum_image
+from eddies.analysis.lagrangian import evenly, near
 from eddies.analysis.pdfs import bin_probabilities
 from eddies.analysis.rollout import Frames, Rollout
-from eddies.kernels.library import library
-from eddies.kernels.neighbors import Box, neighbors_within
 
 # Bins of the PDF of nearest-neighbour distances, in mean spacings; a share exp(-14) of random points lies beyond.
 DISTANCE_EDGES = np.linspace(0, 1.5, 31)
@@ -21,7 +19,6 @@ CELL = 2.0  # side of the cells in which particles are counted, in mean spacings
 
 
 def mean_spacing(total: int, length: float) -> float:
-    """length / total^(1/3)."""
     return length / total ** (1 / 3)
 
 
@@ -35,13 +32,8 @@ def nearest_distances(position: np.ndarray, length: float) -> np.ndarray:
     chosen = evenly(len(position), min(SAMPLED, max(PAIRS // crowd, 1)))
     nearest, missing = np.full(chosen.size, np.inf), np.arange(chosen.size)
     while missing.size and radius < 2 * length:
-        offsets, rows = neighbors_within(library(), Box(length, True), radius, position[chosen[missing]], position,
-                                         exclude_self=False)
-        number = np.repeat(missing, np.diff(offsets))
-        others = rows != chosen[number]
-        number, rows = number[others], rows[others]
-        apart = minimum_image(position[rows] - position[chosen[number]], length)
-        np.minimum.at(nearest, number, np.sqrt(np.sum(apart**2, axis=1)))
+        places, _, apart = near(position, length, chosen[missing], radius)
+        np.minimum.at(nearest, missing[places], apart)
         missing, radius = np.flatnonzero(np.isinf(nearest)), 2 * radius
     return nearest
 

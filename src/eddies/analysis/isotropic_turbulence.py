@@ -106,16 +106,13 @@ class StationarySpan:
 
     @property
     def turnovers(self) -> float:
-        """Number of large-eddy turnovers."""
         return float(self.columns["turnovers"][-1] - self.columns["turnovers"][0])
 
     @property
     def steps_per_turnover(self) -> float:
-        """Mean number of time steps per turnover."""
         return float(np.sum(np.diff(self.columns["time"]) / self.columns["time_step"][1:]) / self.turnovers)
 
     def mean(self, name: str) -> float:
-        """Time average of a column."""
         return self.average(self.columns[name])[0]
 
     def average(self, values: np.ndarray) -> tuple[float, float]:

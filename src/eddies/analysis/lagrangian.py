@@ -203,14 +203,17 @@ def pair_dispersion(position: Iterable[np.ndarray], groups: Sequence[np.ndarray]
 
 
 def near(position: np.ndarray, length: float, chosen: np.ndarray,
-         radius: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The other rows of positions (n, 3) within a radius of each chosen row, in any order, and their distances."""
+         radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The other rows of positions (n, 3) within a radius of each of the chosen rows (m,), periodic with `length`.
+
+    Returns the place in `chosen`, the other row and the distance of each such pair. Places rise.
+    """
     offsets, rows = neighbors_within(library(), Box(length, True), radius, position[chosen], position, False)
-    for row, first, last in zip(chosen, offsets, offsets[1:]):
-        others = rows[first:last]
-        others = others[others != row]
-        apart = minimum_image(position[others] - position[row], length)
-        yield others, np.sqrt(np.sum(apart**2, axis=1))
+    places = np.repeat(np.arange(chosen.size), np.diff(offsets))
+    others = rows != chosen[places]
+    places, rows = places[others], rows[others]
+    apart = minimum_image(position[rows] - position[chosen[places]], length)
+    return places, rows, np.sqrt(np.sum(apart**2, axis=1))
 
 
 def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], tolerance: float,
@@ -219,14 +222,11 @@ def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], to
 
     The first particle of a pair is one of the first `followed` rows. Each pair appears once.
     """
-    pairs = [[np.empty((2, 0), int)] for _ in distances]
-    chosen, radius = np.arange(min(followed, len(position))), 1.001 * (1 + tolerance) * max(distances, default=0.0)
-    for row, (others, apart) in zip(chosen, near(position, length, chosen, radius)):
-        for distance, at_distance in zip(distances, pairs):
-            second = others[np.abs(apart - distance) <= tolerance * distance]
-            second = np.sort(second[second > row])
-            at_distance.append(np.stack([np.full(second.size, row), second]))
-    return [np.concatenate(at_distance, axis=1) for at_distance in pairs]
+    first = np.arange(min(followed, len(position)))
+    first, second, apart = near(position, length, first, 1.001 * (1 + tolerance) * max(distances, default=0.0))
+    pairs, once = np.stack([first, second]), second > first
+    at_distance = [pairs[:, once & (np.abs(apart - distance) <= tolerance * distance)] for distance in distances]
+    return [chosen[:, np.lexsort(chosen[::-1])] for chosen in at_distance]
 
 
 def nearest_rows(position: np.ndarray, length: float, chosen: np.ndarray, count: int) -> np.ndarray:
@@ -239,8 +239,11 @@ def nearest_rows(position: np.ndarray, length: float, chosen: np.ndarray, count:
     nearest = np.full((count, chosen.size), -1)
     missing, radius = np.arange(chosen.size), 2 * length / len(position) ** (1 / 3)
     while missing.size:
-        for number, (others, apart) in zip(missing, near(position, length, chosen[missing], radius)):
-            if others.size >= count:
-                nearest[:, number] = others[np.lexsort((others, apart))[:count]]
-        missing, radius = np.flatnonzero(nearest[0] < 0), 2 * radius
+        places, rows, apart = near(position, length, chosen[missing], radius)
+        rows = rows[np.lexsort((rows, apart, places))]
+        ends = np.cumsum(np.bincount(places, minlength=missing.size))
+        begins = np.append(0, ends[:-1])
+        enough = ends - begins >= count
+        nearest[:, missing[enough]] = rows[begins[enough] + np.arange(count)[:, None]]
+        missing, radius = missing[~enough], 2 * radius
     return nearest

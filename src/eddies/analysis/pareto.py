@@ -14,11 +14,11 @@ def pareto_front(cost: np.ndarray, error: np.ndarray) -> np.ndarray:
     A point dominates another if neither its cost nor its error is larger and one of them is smaller.
     """
     cost, error = np.asarray(cost, float), np.asarray(error, float)
-    known = np.flatnonzero(np.isfinite(cost) & np.isfinite(error))
+    measured = np.flatnonzero(np.isfinite(cost) & np.isfinite(error))
     front = []
-    for index in known:
-        no_worse = (cost[known] <= cost[index]) & (error[known] <= error[index])
-        better = (cost[known] < cost[index]) | (error[known] < error[index])
+    for index in measured:
+        no_worse = (cost[measured] <= cost[index]) & (error[measured] <= error[index])
+        better = (cost[measured] < cost[index]) | (error[measured] < error[index])
         if not np.any(no_worse & better):
             front.append(index)
     return np.array(sorted(front, key=lambda index: (cost[index], error[index])), dtype=int)
@@ -41,15 +41,15 @@ def verdict(model: Method, others: Sequence[Method], cost: str, measures: Mappin
         if None in (model[key], model[cost]):
             not_worth.append(f"{words} (no number)")
             continue
-        known = [row for row in others if None not in (row[key], row[cost])]
-        rivals = [row for row in known if row[cost] <= model[cost] and not _worse(row, model, key)]
-        beaten = sum(row not in known or _worse(row, model, key) for row in others)
+        measured = [row for row in others if None not in (row[key], row[cost])]
+        rivals = [row for row in measured if row[cost] <= model[cost] and not _worse(row, model, key)]
+        beaten = sum(row not in measured or _worse(row, model, key) for row in others)
         score = f"{words} ({model[key]:.3g}, {beaten} of {len(others)} others beaten; "
         if rivals:
             named = ", ".join(_compared(row, model, key, cost) for row in rivals)
             not_worth.append(f"{score}as accurate and no slower: {named})")
-        elif known:
-            best = min(known, key=lambda row: row[key])
+        elif measured:
+            best = min(measured, key=lambda row: row[key])
             worth.append(f"{score}the best of them: {_compared(best, model, key, cost)})")
         else:
             worth.append(f"{score}none of them has a number)")

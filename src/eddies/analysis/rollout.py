@@ -81,7 +81,6 @@ class SpectraAt:
 
     @property
     def wavenumber(self) -> np.ndarray:
-        """k = 0, 1, ..."""
         return np.arange(len(self.model))
 
     def error(self, of: str, filter_wavenumber: float) -> float:
@@ -143,7 +142,6 @@ class Rollout:
 
     @property
     def filter_width(self) -> float:
-        """d of the filter."""
         return float(self.reference["filter_width"])
 
     @property

@@ -1,6 +1,6 @@
 """Invariants of the velocity gradient tensor: the Q-R plane and the mean motion in it (Eqs. 16-17)."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -75,21 +75,15 @@ class InvariantBins:
         return probabilities / np.outer(np.diff(self.second), np.diff(self.third))
 
 
-@dataclass
 class ConditionalVelocity:
     """Mean (dQ/dt, dR/dt) of Lagrangian particles at given (Q, R): sums over bins.
 
     Rates are in units of <Q_w>^(3/2) and <Q_w>^2. Particles outside the bins are left out.
     """
 
-    bins: InvariantBins
-    count: np.ndarray = field(init=False)
-    second_rate: np.ndarray = field(init=False)
-    third_rate: np.ndarray = field(init=False)
-
-    def __post_init__(self):
-        shape = (self.bins.second.size - 1, self.bins.third.size - 1)
-        self.count, self.second_rate, self.third_rate = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    def __init__(self, bins: InvariantBins) -> None:
+        self.bins = bins
+        self.count, self.second_rate, self.third_rate = np.zeros((3, bins.second.size - 1, bins.third.size - 1))
 
     def add(self, before: Invariants, after: Invariants, interval: float, scale: float) -> None:
         """Add the same particles at two times, `interval` apart; `scale` is <Q_w>.

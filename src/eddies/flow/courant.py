@@ -9,31 +9,31 @@ from eddies.parallel.reduction import global_max
 from eddies.spectral.spectral_grid import SpectralGrid
 
 
+EVERY = 8  # steps between two measurements of the speed
+
+
 class CourantLimit:
     """Time step with  step * (max(|u| + |v| + |w|) + sqrt(3) c) <= courant * dx.
 
     Steps are taken from the ladder largest * 2^-m. The sound speed c counts only for a stepper that treats sound
     explicitly; otherwise pass 0. The factor sqrt(3) belongs to sound that travels along the diagonal. The speed is
-    measured every `every` steps.
+    measured every EVERY steps.
     """
 
-    def __init__(self, grid: SpectralGrid, courant: float, largest: float, sound_speed: float = 0.0,
-                 every: int = 8) -> None:
-        self.grid, self.courant, self.largest, self.sound_speed, self.every = grid, courant, largest, sound_speed, every
+    def __init__(self, grid: SpectralGrid, courant: float, largest: float, sound_speed: float = 0.0) -> None:
+        self.grid, self.courant, self.largest, self.sound_speed = grid, courant, largest, sound_speed
         self._bound = 0.0
 
     def __call__(self, state: np.ndarray, clock: Clock) -> float:
         """Return the next step; the last one is shortened to end at the clock's end."""
-        if clock.steps % self.every == 0 or self._bound == 0.0:
+        if clock.steps % EVERY == 0 or self._bound == 0.0:
             self._bound = self.bound(state, clock)
         return min(ladder_step(self.largest, self._bound), clock.remaining)
 
     def state_dict(self) -> dict[str, float]:
-        """Return the last measured bound, for a checkpoint."""
         return {"bound": self._bound}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """Restore the last measured bound."""
         self._bound = state["bound"]
 
     def bound(self, state: np.ndarray, clock: Clock) -> float:
@@ -51,7 +51,6 @@ class FixedStep:
         self.step = step
 
     def __call__(self, state: np.ndarray, clock: Clock) -> float:
-        """Return the next step."""
         # A remainder that differs from the step by round-off is a full step: another size would need new operators.
         return self.step if clock.remaining > self.step * (1 - 1e-6) else clock.remaining
 
@@ -63,5 +62,4 @@ class FixedStep:
         """Restore nothing."""
 
     def bound(self, state: np.ndarray, clock: Clock) -> float:
-        """Return the step."""
         return self.step

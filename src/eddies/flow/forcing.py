@@ -11,10 +11,6 @@ from eddies.spectral.spectral_grid import SpectralGrid
 SILENT = {"float64": 1e-20, "float32": 1e-10}
 
 
-class ForcingError(UserError, ValueError):
-    """The flow has no energy that the forcing could amplify."""
-
-
 class LinearForcing:
     """Force f(k) = A u_s(k) for 0 < |k| < `wavenumber`, with A = rate / sum |u_s|^2, so that <u.f> = `injection_rate`.
 
@@ -23,7 +19,7 @@ class LinearForcing:
     unfiltered modes, and f is the filtered force of the unfiltered flow.
 
     All ranks hold the few forced modes; one reduction collects them. In the plane kx = 0 mirror modes are made
-    conjugate, because the forcing would amplify a part that no real field has. The first evaluation raises ForcingError
+    conjugate, because the forcing would amplify a part that no real field has. The first evaluation raises UserError
     if the velocity has no energy at the forced modes.
     """
 
@@ -60,9 +56,9 @@ class LinearForcing:
         # Once is enough: forced modes do not lose all their energy, and the sum costs a message.
         total = self.grid.sum_modes((np.abs(velocity) ** 2).sum(axis=0))
         if forced <= SILENT[self.grid.precision] * total:
-            raise ForcingError("[forcing]: the flow has no energy at 0 < |k| < wavenumber = "
-                               f"{self.wavenumber:g}, which linear forcing could amplify; start from a flow with "
-                               "energy there, raise wavenumber, or remove [forcing]")
+            raise UserError("[forcing]: the flow has no energy at 0 < |k| < wavenumber = "
+                            f"{self.wavenumber:g}, which linear forcing could amplify; start from a flow with "
+                            "energy there, raise wavenumber, or remove [forcing]")
         self._checked = True
 
     def _forced_modes(self, velocity: np.ndarray) -> np.ndarray:

@@ -72,7 +72,6 @@ class FlowHistory:
         return defect / scale if scale > 0 else defect
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return all rows as columns."""
         return {name: np.array([row[name] for row in self.rows]) for name in self.rows[0]}
 
     def state_dict(self) -> dict[str, Any]:
@@ -84,7 +83,6 @@ class FlowHistory:
                 **{f"history_{name}": values for name, values in columns.items()}}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
         saved = state["history"]
         columns = {name: state[f"history_{name}"] for name in saved["columns"]}
         self.spectra = list(state["spectra_of_history"])

@@ -46,7 +46,6 @@ class IncompressibleFluid(Fluid):
     compressible, transforms = False, 9
 
     def nonlinear(self, state: np.ndarray) -> np.ndarray:
-        """Return P[u x omega + f]."""
         products = self.grid.multiply(state, self._formulas.cross, 3, fields=6, expand=self._with_vorticity,
                                       z_derivatives=2)
         if self.closure is not None:
@@ -63,7 +62,6 @@ class IncompressibleFluid(Fluid):
         return [modes[:3], np.stack([d_dy[0] * w - dv_dz, du_dz - d_dx[0] * w, d_dx[0] * v - d_dy[0] * u])]
 
     def linear(self, state: np.ndarray) -> np.ndarray:
-        """Return -nu k^2 u."""
         return -self.viscosity * self.grid.wavenumber_squared * state
 
     def linear_function(self, function: ScalarFunction, step: float) -> np.ndarray:
@@ -71,7 +69,6 @@ class IncompressibleFluid(Fluid):
         return functions_of_wavenumber(self.grid, lambda k2: [function(-self.viscosity * k2 * step).real])
 
     def combine(self, *terms: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-        """Return the sum of linear functions applied to states."""
         return self._formulas.sum_of_decays(terms)
 
 
@@ -89,7 +86,6 @@ class CompressibleFluid(Fluid):
     compressible, transforms = True, 19
 
     def nonlinear(self, state: np.ndarray) -> np.ndarray:
-        """Return -u.grad u + 2 nu (S - 1/3 div u).grad s + f, and -u.grad s."""
         tendency = self.grid.multiply(state, self._advection, 4, fields=15, expand=self._with_gradients,
                                       z_derivatives=4)
         if self.forcing is not None:
@@ -142,7 +138,6 @@ class CompressibleFluid(Fluid):
         return functions_of_wavenumber(self.grid, factors)
 
     def combine(self, *terms: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-        """Return the sum of linear functions applied to states."""
         return self._formulas.sum_of_acoustic_blocks(terms)
 
 

@@ -53,7 +53,6 @@ class StepLimit:
 
     @property
     def exceeded(self) -> bool:
-        """Whether the number is beyond the boundary."""
         return self.number > self.boundary
 
     def __str__(self) -> str:
@@ -167,5 +166,4 @@ class StabilityWatch:
         return {"ceiling": self._ceiling if math.isfinite(self._ceiling) else None}
 
     def load_state_dict(self, state: dict[str, float | None]) -> None:
-        """Restore the available energy."""
         self._ceiling = math.inf if state["ceiling"] is None else state["ceiling"]

@@ -46,7 +46,6 @@ class StressModel(Closure):
         self.grid, self.squared_length, self.squared_width = grid, mixing_length**2, filter_width**2
 
     def add(self, velocity: np.ndarray, tendency: np.ndarray) -> None:
-        """Add -div tau to the velocity's tendency in place."""
         tendency -= self.grid.stress_divergence(self.stress(velocity))
 
     def stress(self, velocity: np.ndarray) -> np.ndarray:
@@ -86,7 +85,7 @@ class DynamicStress(StressModel):
     width d the first filter is Gaussian of width d, ^ is Gaussian of width 2 d, and r = 5.
     """
 
-    def __init__(self, grid: SpectralGrid, filter_width: float = 0.0, with_gradient: bool = False) -> None:
+    def __init__(self, grid: SpectralGrid, filter_width: float, with_gradient: bool = False) -> None:
         super().__init__(grid, 0.0, filter_width if with_gradient else 0.0)
         if filter_width:
             self.test, self.ratio = gaussian_transfer(grid.wavenumber_squared, 2 * filter_width).astype(grid.real), 5.0
@@ -97,7 +96,6 @@ class DynamicStress(StressModel):
             self.ratio = (grid.cutoff / half) ** 2
 
     def begin_step(self, velocity: np.ndarray) -> None:
-        """Compute the mixing length; collective."""
         test, coarser = self.test, self.test * velocity
         hidden = test * self.grid.squares(velocity) - self.grid.squares(coarser)
         strain, coarser_strain = (self.modes_of(strain_product, u) for u in (velocity, coarser))
@@ -121,7 +119,6 @@ class ModeDamping(Closure):
         self.grid, self.shape, self.amplitude = grid, shape, 0.0
 
     def add(self, velocity: np.ndarray, tendency: np.ndarray) -> None:
-        """Add the force to the velocity's tendency in place."""
         tendency -= (self.amplitude * self.shape).astype(self.grid.real) * velocity
 
 
@@ -138,7 +135,6 @@ class SpectralViscosity(ModeDamping):
         super().__init__(grid, PLATEAU * (1 + CUSP * np.exp(-STEEPNESS * grid.cutoff / k)) * grid.wavenumber_squared)
 
     def begin_step(self, velocity: np.ndarray) -> None:
-        """Measure E(k_c); collective."""
         _, energy = energy_spectrum(self.grid, velocity)
         self.amplitude = np.sqrt(energy[self.grid.cutoff] / self.grid.cutoff)
 
@@ -155,7 +151,6 @@ class EddyDamping(ModeDamping):
         super().__init__(grid, grid.cutoff * rising(np.sqrt(grid.index_squared), grid.cutoff, rates))
 
     def begin_step(self, velocity: np.ndarray) -> None:
-        """Measure u_c; collective."""
         self.amplitude = np.sqrt(self.grid.sum_modes(self._small * (np.abs(velocity) ** 2).sum(axis=0)) / 3)
 
 

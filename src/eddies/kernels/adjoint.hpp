@@ -1,10 +1,10 @@
-// Formulas of vectors that are written once. Of plain vectors they are evaluated; of `Place`s the chain rule is taken
-// back through them.
+// Reverse-mode differentiation of formulas of vectors. Each formula is written once: with plain vectors as arguments it
+// is evaluated, with `Place`s as arguments it is differentiated.
 //
-// A formula gives names to its intermediate results by `let`. An expression holds the places that it is made of by
-// reference, and its parts by value; `back` takes the gradient by it to those places. A name takes what it was given to
-// what it is made of when its life ends. Lives end in the reverse order of their begin, which is the order of the chain
-// rule. A name must outlive what is made of it: none is an operand where it is made.
+// `let` stores an intermediate result. An expression holds its places by reference and its parts by value; `back` adds
+// the gradient by the expression to the gradients by its places. A stored result passes its gradient on when it is
+// destroyed. C++ destroys in the reverse order of construction, which is the order of the chain rule. A stored result
+// must outlive all expressions that use it.
 
 #pragma once
 
@@ -14,7 +14,7 @@
 
 namespace eddies {
 
-// Something with a `value` that the chain rule goes back through.
+// A node of the formula: it has a `value` and a method `back`.
 template <typename Real>
 struct Node {
     using Number = Real;
@@ -26,7 +26,7 @@ constexpr bool is_node = false;
 template <typename A>
 constexpr bool is_node<A, std::void_t<typename A::Number>> = true;
 
-// What no gradient is asked for.
+// A constant, without a gradient.
 template <typename Real>
 struct Constant : Node<Real> {
     Vector<Real> value;
@@ -35,7 +35,7 @@ struct Constant : Node<Real> {
     void back(Vector<Real>) const {}
 };
 
-// A number, and the gradient by it, zero at first.
+// A variable and the gradient by it, initially zero.
 template <typename Real>
 struct Place : Node<Real> {
     Vector<Real> value;
@@ -48,7 +48,7 @@ struct Place : Node<Real> {
 template <typename A>
 using Held = std::conditional_t<std::is_base_of_v<Place<typename A::Number>, A>, const A&, const A>;
 
-// What is made of two others, with its slopes by them.
+// A function of two nodes, with its partial derivatives.
 template <typename A, typename B>
 struct Made : Node<typename A::Number> {
     using V = Vector<typename A::Number>;
@@ -71,7 +71,7 @@ struct Named : Place<typename A::Number> {
     ~Named() { made.back(this->by); }
 };
 
-// A name for what is used more than once.
+// A stored intermediate result.
 template <typename A>
 inline auto let(const A& made) {
     if constexpr (is_node<A>) return Named<A>(made);
@@ -84,7 +84,7 @@ inline const auto& value_of(const A& a) {
     else return a;
 }
 
-// Of two operands one is a node: the number type, and the other as a node too.
+// For two operands of which one is a node: the number type, and both as nodes.
 template <typename A, typename B>
 using NumberOf = typename std::conditional_t<is_node<A>, A, B>::Number;
 
@@ -116,7 +116,7 @@ EDDIES_OPERATOR(operator/, x / y, Real(1) / y, -x / (y * y))
 
 #undef EDDIES_OPERATOR
 
-// A number for each lane of what is alike.
+// The same number in each lane.
 template <typename A, typename Vector>
 inline auto spread(const A& a, const Vector&) {
     if constexpr (std::is_arithmetic_v<A>) return Vector{} + a;
@@ -137,13 +137,13 @@ inline auto where(Mask mask, const A& a, const B& b) {
     }
 }
 
-// The lower of a number and a limit, at which it no longer varies.
+// Minimum of a node and a constant limit.
 template <typename Real, typename A>
 inline auto at_most(const A& a, Real limit) {
     return where(value_of(a) < limit, a, limit);
 }
 
-// Of two vectors in space.
+// Scalar product of two vectors in space.
 template <typename A, typename B>
 inline auto product(const A (&a)[3], const B (&b)[3]) {
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];

@@ -1,4 +1,4 @@
-// Particles in order of place: rows of cells along x, so that what may lie near a point are a few ranges of particles.
+// Particles sorted by place: rows of cells along x, so that the neighbours of a point lie in a few ranges of particles.
 
 #pragma once
 
@@ -11,8 +11,8 @@
 
 namespace eddies {
 
-// How a coordinate is kept: as the fraction of a period that it is at, so that differences are those of nearest images.
-// In single precision that is a whole number of 2^-32 periods, whose differences wrap by themselves and are exact.
+// Coordinates are stored as fractions of a period, so that differences are those of nearest images. In single precision
+// a fraction is an integer in units of 2^-32 periods: differences wrap by themselves and are exact.
 template <typename Real>
 struct Turns;
 
@@ -37,7 +37,7 @@ struct Turns<double> {
     static type of(double fraction) { return fraction; }
     static Vector<double> all(type one) { return Vector<double>{} + one; }
     static Vector<double> difference(Vector<double> a, Vector<double> b) {
-        constexpr double round = 6755399441055744.0;  // 1.5 2^52, next to which numbers are whole
+        constexpr double round = 6755399441055744.0;  // 1.5 2^52, added to a number, it rounds it to an integer
         const Vector<double> d = a - b;
         return d - ((d + round) - round);
     }
@@ -45,14 +45,14 @@ struct Turns<double> {
 
 constexpr int CANDIDATES = 64;  // particles that are looked at together, a bit for each
 
-// The first of some positions (count, 3) that is not finite, or -1.
+// Number of the first position (count, 3) that is not finite, or -1.
 inline std::int64_t not_finite(const double* position, std::int64_t count) {
     for (std::int64_t p = 0; p < count; ++p)
         if (!std::isfinite(position[3 * p] + position[3 * p + 1] + position[3 * p + 2])) return p;
     return -1;
 }
 
-// A range of particles in order of place.
+// A range of sorted particles.
 struct Range {
     std::int64_t first, last;
 };
@@ -68,7 +68,7 @@ struct Columns {
     std::int32_t first, last;
 };
 
-// How far a point is from rows that lie, along one axis, a step back, no step and a step on.
+// Distance of a point from the rows one step back, in place and one step ahead along one axis.
 struct Edges {
     double gap[3];
 };
@@ -84,9 +84,8 @@ class Cells {
     std::vector<std::int64_t> start;                             // of each cell, x fastest
     Real scale[3];                                               // of differences of turns
 
-    // Put particles (count, 3) in order, in a box of this length, periodic along x and y, and along z if so told; cells
-    // no narrower than `reach` across rows. Points (number, 3) are others that `place` will be asked of, or null. All
-    // are finite.
+    // Sort particles (count, 3) of a box of this length, periodic along x and y, and along z if `periodic_z`. Cells are
+    // at least `reach` wide across rows. Points (number, 3) are further arguments of `place`, or null. All are finite.
     void arrange(const double* position, std::int64_t particles, const double* points, std::int64_t number,
                  double length, bool periodic_z, double reach) {
         count = particles;
@@ -107,7 +106,7 @@ class Cells {
         wraps[2] = periodic_z;
         origin = lowest;
         const double span = highest - lowest;
-        // Where it is not periodic, z has a period so long that no image is near.
+        // Without periodicity z gets a period so long that no image is near.
         for (double& one : period) one = length;
         if (!periodic_z) period[2] = 4.0 * std::max(span, reach);
         const double most = std::sqrt(static_cast<double>(count)) + 1.0;  // never many more cells than particles
@@ -145,16 +144,16 @@ class Cells {
     };
 
     Place place(const double* position) const {
-        Place found;
+        Place place;
         const std::int64_t cells[3] = {columns, lines, planes};
         for (int axis = 0; axis < 3; ++axis) {
             const double turns = (position[axis] - (axis == 2 ? origin : 0.0)) / period[axis];
             const double fraction = std::min(std::max(turns - std::floor(turns), 0.0), 1.0 - 1e-15);
-            found.fraction[axis] = fraction;
-            found.index[axis] =
+            place.fraction[axis] = fraction;
+            place.index[axis] =
                 width[axis] > 0.0 ? std::min(static_cast<std::int64_t>(fraction / width[axis]), cells[axis] - 1) : 0;
         }
-        return found;
+        return place;
     }
 
     std::int64_t rows() const { return lines * planes; }
@@ -162,8 +161,8 @@ class Cells {
     Range of_row(std::int64_t row) const { return {start[row * columns], start[(row + 1) * columns]}; }
 
     // The rows that touch a row, itself included, each once.
-    void near(std::int64_t row, std::vector<NearRow>& found) const {
-        found.clear();
+    void near(std::int64_t row, std::vector<NearRow>& rows) const {
+        rows.clear();
         const std::int64_t z = row / lines, y = row % lines;
         for (int dz = -1; dz <= 1; ++dz)
             for (int dy = -1; dy <= 1; ++dy) {
@@ -171,14 +170,14 @@ class Cells {
                 if (wraps[2]) other_z = (other_z + planes) % planes;
                 if (other_z < 0 || other_z >= planes) continue;
                 const std::int64_t other = other_z * lines + other_y;
-                const bool known = std::any_of(found.begin(), found.end(),
+                const bool listed = std::any_of(rows.begin(), rows.end(),
                                                [other](const NearRow& it) { return it.row == other; });
-                if (!known) found.push_back({other, {dy, dz}});
+                if (!listed) rows.push_back({other, {dy, dz}});
             }
     }
 
-    // Those particles of a row near another that may be within a distance of a point in that one, which is so far from
-    // the edges of its row, and at this fraction of a period along x: up to two ranges.
+    // Particles of a nearby row that may be within a distance of a point, given its distances from the edges of its own
+    // row and its fraction of a period along x: up to two ranges.
     int within(double x, const Edges* edges, const NearRow& near, double distance, Range* ranges) const {
         double left = distance * distance;
         for (int across = 0; across < 2; ++across) {
@@ -191,7 +190,7 @@ class Cells {
                       static_cast<std::int64_t>((place + half) * static_cast<double>(columns)), ranges);
     }
 
-    // Particles of a row from one column to another, of which a period has been added: up to two ranges.
+    // Particles of a row between two columns, to which a period has been added: up to two ranges.
     int pieces(std::int64_t row, std::int64_t low, std::int64_t high, Range* ranges) const {
         const std::int64_t* row_start = &start[row * columns];
         if (high - low + 1 >= columns) {
@@ -210,9 +209,9 @@ class Cells {
         return 2;
     }
 
-    // For each particle of a row the columns of a row near it, as `pieces` takes them, where others may be within a
-    // distance; the last before the first where there are none.
-    void columns_within(std::int64_t row, const NearRow& near, double distance, Columns* found) const {
+    // For each particle of a row: the columns of a nearby row, in the form of `pieces`, in which others may be within a
+    // distance. The last column lies before the first if no column qualifies.
+    void columns_within(std::int64_t row, const NearRow& near, double distance, Columns* columns_near) const {
         const std::int64_t cells[2] = {lines, planes}, index[2] = {row % lines, row / lines};
         double edge[2], slope[2];  // the gap across is the slope times how far a particle is from the edge
         for (int across = 0; across < 2; ++across) {
@@ -231,39 +230,39 @@ class Cells {
             const double left = square - gap_y * gap_y - gap_z * gap_z;
             const double half = std::sqrt(std::max(left, 0.0)) / period[0] + 1e-9;
             const double place = static_cast<double>(xs[i]) * unit + 1.0;  // so that it is not negative
-            found[i].first = static_cast<std::int32_t>((place - half) * number);
-            found[i].last = left > 0.0 ? static_cast<std::int32_t>((place + half) * number) : -1;
+            columns_near[i].first = static_cast<std::int32_t>((place - half) * number);
+            columns_near[i].last = left > 0.0 ? static_cast<std::int32_t>((place + half) * number) : -1;
         }
     }
 
-    // How far a point is from the rows on both sides of its own.
-    void edges(const Place& place, Edges* found) const {
+    // Distance of a point from the rows on both sides of its own.
+    void edges(const Place& place, Edges* result) const {
         const std::int64_t cells[2] = {lines, planes};
         for (int across = 0; across < 2; ++across) {
             const int axis = across + 1;
             const double at = place.fraction[axis], lower = static_cast<double>(place.index[axis]) * width[axis];
             // Where there are only two rows, one is on both sides of the other.
-            const double known = wraps[axis] && cells[across] < 3 ? 0.0 : period[axis];
-            found[across] = {{std::max(at - lower, 0.0) * known, 0.0, std::max(lower + width[axis] - at, 0.0) * known}};
+            const double unit = wraps[axis] && cells[across] < 3 ? 0.0 : period[axis];
+            result[across] = {{std::max(at - lower, 0.0) * unit, 0.0, std::max(lower + width[axis] - at, 0.0) * unit}};
         }
     }
 
-    // Which of up to CANDIDATES particles that follow each other are nearer to a point at these turns than the root of a
+    // Bits of up to CANDIDATES consecutive particles whose squared distance from a point at these turns is below a
     // limit.
     std::uint64_t nearer(const Turn* at, std::int64_t begin, int number, Real limit) const {
         using T = Turns<Real>;
         using V = Vector<Real>;
         constexpr int lanes = VectorOf<Real>::lanes;
-        std::uint64_t found = 0;
+        std::uint64_t mask = 0;
         for (int p = 0; p < number; p += lanes) {
             V square{};
             for (int axis = 0; axis < 3; ++axis) {
                 const V d = T::difference(T::all(at[axis]), unaligned(&turn[axis][begin + p])) * scale[axis];
                 square += d * d;
             }
-            found |= bits(square < limit) << p;
+            mask |= bits(square < limit) << p;
         }
-        return number < CANDIDATES ? found & ((std::uint64_t(1) << number) - 1) : found;
+        return number < CANDIDATES ? mask & ((std::uint64_t(1) << number) - 1) : mask;
     }
 
    private:

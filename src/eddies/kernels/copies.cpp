@@ -1,15 +1,16 @@
 // Copies around the one-dimensional transforms of a slab; each function reads and writes the memory once.
-// tests/kernels/test_copies.py compares them with numpy. Complex numbers are real and imaginary part, one after the other.
+// tests/kernels/test_copies.py compares them with numpy. Complex numbers are real and imaginary part, one after the
+// other.
 
 #include <cstdint>
 #include <vector>
 
 extern "C" {
 
-// Arrays (components, planes, lines, width) of complex numbers that ranks exchange, of each rank some planes or some
-// lines of the whole: those from `starts` on; kernels/copies.py has the same structure.
+// Blocks (components, planes, lines, width) of complex numbers that ranks exchange. The block of a rank holds the
+// planes or the lines from its entry of `starts` on. kernels/copies.py has the same structure.
 struct Blocks {
-    std::int64_t ranks, planes, lines, width;  // planes or lines of all ranks together where these are cut
+    std::int64_t ranks, planes, lines, width;  // the cut axis: its length over all ranks
     void* const* addresses;                    // (ranks)
     const std::int64_t* starts;                // (ranks + 1)
 };
@@ -20,27 +21,27 @@ namespace {
 
 using Int = std::int64_t;
 
-constexpr Int FEW = 1 << 14;  // complex numbers that are not worth a second thread
+constexpr Int FEW = 1 << 14;  // complex numbers below which one thread is used
 
-// The lines of a plane of blocks that are cut along them.
+// Addresses of the lines of a plane, for blocks that are cut along lines.
 template <typename Real>
-void find_lines(const Blocks& blocks, Int component, Int plane, Real** found) {
+void find_lines(const Blocks& blocks, Int component, Int plane, Real** lines) {
     for (Int rank = 0; rank < blocks.ranks; ++rank) {
         const Int start = blocks.starts[rank], count = blocks.starts[rank + 1] - start;
         Real* line = static_cast<Real*>(blocks.addresses[rank]) +
                      2 * (component * blocks.planes + plane) * count * blocks.width;
-        for (Int y = start; y < start + count; ++y, line += 2 * blocks.width) found[y] = line;
+        for (Int y = start; y < start + count; ++y, line += 2 * blocks.width) lines[y] = line;
     }
 }
 
-// All planes of blocks that are cut along them.
+// Addresses of all planes, for blocks that are cut along planes.
 template <typename Real>
-void find_planes(const Blocks& blocks, Int component, Real** found) {
+void find_planes(const Blocks& blocks, Int component, Real** planes) {
     const Int plane = 2 * blocks.lines * blocks.width;
     for (Int rank = 0; rank < blocks.ranks; ++rank) {
         const Int start = blocks.starts[rank], count = blocks.starts[rank + 1] - start;
         Real* first = static_cast<Real*>(blocks.addresses[rank]) + component * count * plane;
-        for (Int z = start; z < start + count; ++z) found[z] = first + (z - start) * plane;
+        for (Int z = start; z < start + count; ++z) planes[z] = first + (z - start) * plane;
     }
 }
 
@@ -108,9 +109,9 @@ void pack(const Blocks& blocks, Int components, Int first, Int planes, Real* pac
 template <typename Real>
 void unpack(const Blocks& blocks, Int component, Int first, Int planes, const Real* rows, Int cells, Int width) {
     const Int K = blocks.width - 1, lines = 2 * K + 1, pairs = (planes + 1) / 2;
-    std::vector<Real*> found(2 * pairs * lines);
+    std::vector<Real*> addresses(2 * pairs * lines);
     for (Int plane = 0; plane < planes; ++plane)
-        find_lines(blocks, component, first + plane, found.data() + plane * lines);
+        find_lines(blocks, component, first + plane, addresses.data() + plane * lines);
 #pragma omp parallel for schedule(static) if (pairs * lines * lines > FEW)
     for (Int line = 0; line < pairs * lines; ++line) {
         const Int pair = line / lines, y = line % lines;
@@ -118,7 +119,7 @@ void unpack(const Blocks& blocks, Int component, Int first, Int planes, const Re
         const Real* __restrict p = plane + 2 * (y <= K ? y : cells - lines + y) * width;
         const Int turned = y == 0 ? 0 : (y <= K ? cells - y : lines - y);
         const Real* __restrict m = plane + 2 * turned * width;
-        Real* __restrict f = found[line];
+        Real* __restrict f = addresses[line];
         const bool alone = pair + pairs >= planes;
         f[0] = p[0] + m[0];
         f[1] = p[1] - m[1];
@@ -128,7 +129,7 @@ void unpack(const Blocks& blocks, Int component, Int first, Int planes, const Re
             f[2 * x + 1] = p[2 * x + 1] - m[2 * (width - x) + 1];
         }
         if (alone) continue;
-        Real* __restrict g = found[line + pairs * lines];
+        Real* __restrict g = addresses[line + pairs * lines];
         g[0] = p[1] + m[1];
         g[1] = m[0] - p[0];
 #pragma omp simd
@@ -180,8 +181,8 @@ void join(Int points, const Real* __restrict f, const Real* __restrict g, Real* 
     }
 }
 
-// Modes (kz, lines, width) at some lines, to a column (cells, those lines, width) with a gap in z, whose numbers of one z
-// lie `apart` from those of the next.
+// Copy some lines of modes (kz, lines, width) to a column (cells, some lines, width) whose kept modes lie at both ends
+// of z. Successive z of the column are `apart` numbers from each other.
 template <typename Real>
 void fill_column(Int K, Int cells, Int plane, Int count, Int apart, const Real* modes, const Real* factors,
                  Real* column) {

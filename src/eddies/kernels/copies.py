@@ -40,14 +40,9 @@ class _Array:
     def __init__(self, array: np.ndarray, gaps: bool = False) -> None:
         contiguous = array[0] if gaps else array
         require(contiguous, contiguous.shape, array.dtype)
-        self._array, self.address, self.dtype = array, array.ctypes.data, array.dtype
+        self._array, self.address = array, array.ctypes.data
         self.shape, self.strides = array.shape, array.strides
         self.apart = array.strides[0] // array.itemsize
-
-    def require(self, shape: tuple[int, ...], dtype: np.dtype) -> None:
-        """Raise ValueError if the array has another shape or type."""
-        if self.shape != shape or self.dtype != dtype:
-            raise ValueError(f"{self.dtype} {self.shape}: contiguous {dtype} {shape} is needed")
 
 
 class _Copies:
@@ -60,12 +55,10 @@ class _Copies:
         self._cells, self._cutoff, self._kept = cells, cutoff, 2 * cutoff + 1
 
     def described_blocks(self, blocks: Sequence[np.ndarray]) -> _Blocks:
-        """Blocks as the other methods take them."""
         return _Blocks(blocks, self.exchanged_axis, self._dtype)
 
-    def described(self, array: np.ndarray) -> _Array:
-        """An array as the other methods take it."""
-        return _Array(array)
+    def described(self, array: np.ndarray, gaps: bool = False) -> _Array:
+        return _Array(array, gaps)
 
     def _function(self, name: str, *arguments: type) -> Callable[..., None]:
         precision = "float64" if self._dtype == np.complex128 else "float32"
@@ -77,8 +70,8 @@ class _Copies:
 class ColumnCopies(_Copies):
     """Copies between modes, columns and blocks for transforms along z.
 
-    Modes have shape (c, kz, y, x). Columns (z, rows, x) hold some rows of y of one component. Blocks (c, z, y, x) are
-    what ranks exchange; they follow each other in z.
+    Modes have shape (c, kz, y, x). Columns (z, rows, x) hold some rows of y of one component, and may have gaps between
+    successive z. Blocks (c, z, y, x) are what ranks exchange; they follow each other in z.
     """
 
     exchanged_axis = 1
@@ -90,15 +83,9 @@ class ColumnCopies(_Copies):
         self._send = self._function("send_column", ADDRESS, *4 * [INT], ADDRESS)
         self._receive = self._function("receive_column", ADDRESS, *4 * [INT], ADDRESS)
 
-    def described_column(self, column: np.ndarray) -> _Array:
-        """A column as the other methods take it; each z is contiguous, with any gap before the next."""
-        return _Array(column, gaps=True)
-
     def fill(self, modes: _Array, component: int, rows: slice, factors: _Array | None, column: _Array) -> None:
         """Copy modes, times factors (kz) if given, to a column."""
         sizes, start = self._sizes(modes, component, rows, column)
-        if factors is not None:
-            factors.require(modes.shape[1:2], self._dtype)
         self._fill(*sizes, start, None if factors is None else factors.address, column.address)
 
     def store(self, column: _Array, scale: float, modes: _Array, component: int, rows: slice) -> None:
@@ -116,16 +103,12 @@ class ColumnCopies(_Copies):
 
     def _sizes(self, modes: _Array, component: int, rows: slice, column: _Array) -> tuple[tuple[int, ...], int]:
         """Sizes for the library, and the address of the rows in the modes."""
-        components, _, lines, width = modes.shape
-        modes.require((components, self._kept, lines, width), self._dtype)
-        column.require((self._cells, rows.stop - rows.start, width), self._dtype)
+        _, _, lines, width = modes.shape
         start = modes.address + component * modes.strides[0] + rows.start * modes.strides[2]
         return (self._cutoff, self._cells, lines * width, column.shape[1] * width, column.apart), start
 
     def _exchange(self, function: Callable[..., None], column: _Array, blocks: _Blocks, component: int,
                   rows: slice) -> None:
-        _, planes, _, width = blocks.shape
-        column.require((planes, rows.stop - rows.start, width), self._dtype)
         function(ctypes.byref(blocks), component, rows.start, rows.stop - rows.start, column.apart, column.address)
 
 
@@ -142,7 +125,6 @@ class PlaneCopies(_Copies):
 
     def __init__(self, library: ctypes.CDLL, cells: int, cutoff: int, dtype: np.dtype) -> None:
         super().__init__(library, cells, cutoff, dtype)
-        self._real = np.zeros(1, self._dtype).real.dtype
         self._pack = self._function("pack", ADDRESS, *3 * [INT], ADDRESS)
         self._unpack = self._function("unpack", ADDRESS, *5 * [INT], ADDRESS)
         self._fill = self._function("fill", *4 * [INT], *4 * [ADDRESS])
@@ -151,7 +133,7 @@ class PlaneCopies(_Copies):
     def pack(self, blocks: _Blocks, planes: slice) -> np.ndarray:
         """Packed modes of some planes."""
         components, count = blocks.shape[0], planes.stop - planes.start
-        packed = np.empty((components, self._pairs(blocks, planes), self._kept, self._kept), self._dtype)
+        packed = np.empty((components, (count + 1) // 2, self._kept, self._kept), self._dtype)
         self._pack(ctypes.byref(blocks), components, planes.start, count, _address(packed))
         return packed
 
@@ -162,7 +144,6 @@ class PlaneCopies(_Copies):
         """
         part, (pairs, _, width) = np.ascontiguousarray(part, self._dtype), rows.shape
         require(part, (len(part), pairs, self._kept, self._kept), self._dtype)
-        rows.require((pairs, self._cells, width), self._dtype)
         by_y = by_x = None
         if factors is not None:
             along_x = factors.shape[-1] > 1
@@ -176,10 +157,8 @@ class PlaneCopies(_Copies):
 
     def unpack(self, rows: _Array, blocks: _Blocks, component: int, planes: slice) -> None:
         """Copy twice the modes of some planes from the output of the transform along y to a component of blocks."""
-        pairs, width = self._pairs(blocks, planes), rows.shape[-1]
-        rows.require((pairs, self._cells, width), self._dtype)
-        self._unpack(ctypes.byref(blocks), component, planes.start, planes.stop - planes.start, self._cells, width,
-                     rows.address)
+        self._unpack(ctypes.byref(blocks), component, planes.start, planes.stop - planes.start, self._cells,
+                     rows.shape[-1], rows.address)
 
     def split(self, complex_planes: _Array, real: _Array, component: int, planes: slice) -> None:
         """Copy complex planes (pairs, y, x) to some real planes of fields (c, planes, y, x)."""
@@ -190,17 +169,9 @@ class PlaneCopies(_Copies):
         points, place, f, g = self._halves(complex_planes, real, component, planes)
         self._join(points, f, g, place)
 
-    def _pairs(self, blocks: _Blocks, planes: slice) -> int:
-        if blocks.shape[2:] != (self._kept, self._cutoff + 1):
-            raise ValueError(f"blocks of {blocks.shape[2:]} modes: {(self._kept, self._cutoff + 1)} are needed")
-        return (planes.stop - planes.start + 1) // 2
-
     def _halves(self, complex_planes: _Array, real: _Array, component: int, planes: slice) -> tuple[int, ...]:
         """Number of points; addresses of the complex planes and of the first and second half of the real planes."""
-        count, (components, all_planes, y, x) = planes.stop - planes.start, real.shape
-        pairs = (count + 1) // 2
-        complex_planes.require((pairs, y, x), self._dtype)
-        real.require((components, all_planes, y, x), self._real)
+        count, (pairs, y, x) = planes.stop - planes.start, complex_planes.shape
         f = real.address + component * real.strides[0] + planes.start * real.strides[1]
         return pairs * y * x, complex_planes.address, f, f + (count - pairs) * real.strides[1]
 

@@ -20,9 +20,9 @@ namespace {
 
 using Int = std::int64_t;
 
-constexpr Int FEW = 1 << 14;  // numbers that are not worth a second thread
+constexpr Int FEW = 1 << 14;  // numbers below which one thread is used
 
-// Values of each field are `apart` numbers from those of the next.
+// Successive fields are `apart` numbers from each other.
 template <typename Real, bool viscous>
 void advection(Int points, Int apart, const Real* fields, Real nu, Int out_apart, Real* out) {
     const Real *u = fields, *x = fields + 3 * apart, *y = x + 4 * apart, *z = y + 4 * apart;
@@ -91,7 +91,7 @@ void project(const Modes& modes, const Real* vector, Real* result) {
     });
 }
 
-// Where the line is whose factors are those of a line of modes: that of |kz|.
+// Position of the factors of a line of modes: those of |kz|.
 inline Int line_of_factors(const Modes& modes, Int z, Int y) {
     return std::min(z, 2 * modes.cutoff + 1 - z) * modes.lines + y;
 }
@@ -149,7 +149,7 @@ void acoustic_blocks(const Modes& modes, Int terms, const Real* const* factors, 
                      Real* result) {
     const Int width = modes.cutoff + 1, size = 2 * (2 * modes.cutoff + 1) * modes.lines * width;
     for_lines(modes, [&](Int line, Int z, Int y) {
-        // Of the line (u, v, w, sigma) and what is to be multiplied by k, real parts and imaginary ones apart.
+        // (u, v, w, sigma) along the line and the factor of k, separated into real and imaginary parts.
         thread_local std::vector<Real> memory;
         memory.assign(10 * width, 0);
         Real *const sums = memory.data(), *const along = sums + 8 * width;

@@ -81,7 +81,6 @@ class Formulas:
         return result
 
     def _place(self, fields: np.ndarray, count: int, size: int) -> tuple[int, int]:
-        """Distance between fields in numbers, and their address."""
         if (len(fields) != count or fields[0].size != size or fields.dtype != self._real
                 or not fields[0].flags.c_contiguous):
             raise ValueError(f"{fields.dtype} {fields.shape}: {count} contiguous fields of {self._real}, {size} values "

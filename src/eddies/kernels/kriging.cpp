@@ -17,8 +17,8 @@ struct Kriging {
     std::int64_t receivers, pairs, sited;  // the last: whether a receiver is a particle, whose own value counts
     const std::int64_t* offsets;    // (receivers + 1,)
     const void* displacement;       // (3, pairs), from a neighbour to its receiver
-    double support, noise;          // the latter is that of a neighbour at the receiver's own place
-    std::int64_t most;              // neighbours of a receiver; one with more has weights that are no numbers
+    double support, noise;          // `noise` of a neighbour at the receiver's own place
+    std::int64_t most;              // largest number of neighbours; the weights of a receiver with more are NaN
     std::int64_t scales;
     double slowest;                 // the covariance is sum_m amplitude_m exp(-slowest 2^m r^2), the widest first
     const double* amplitudes;       // (scales,)
@@ -27,10 +27,10 @@ struct Kriging {
 };
 
 // Some rows of these weights, and fields that they are applied to.
-struct Told {
+struct WeightedSums {
     std::int64_t receivers, rows, columns;
     const std::int64_t *offsets, *senders;
-    const void* const* own;         // rows of (receivers,), or null: receivers are no particles
+    const void* const* own;         // rows of (receivers,); null if receivers are not particles
     const void* const* weights;     // rows of (pairs,)
     const void* field;              // (seen, columns), receivers first if they are particles
     void* result;                   // (receivers, columns, rows)
@@ -62,8 +62,8 @@ inline Vector<Real> series_of_exp_minus(Vector<Real> x) {
     return 1 + sum * x;
 }
 
-// exp(-x) of 0 <= x, to some last places of single or double precision: 2^-n times the series of what remains, and 0
-// from where that has no normal numbers.
+// exp(-x) for 0 <= x, to a few units in the last place: 2^-n times the series of the remainder; 0 where the result
+// would be denormal.
 template <typename Real>
 inline Vector<Real> exp_minus(Vector<Real> x) {
     constexpr bool single = sizeof(Real) == 4;
@@ -71,13 +71,13 @@ inline Vector<Real> exp_minus(Vector<Real> x) {
     const auto beyond = x > all<Real>(most);
     x = beyond ? all<Real>(most) : x;
     const Vector<Real> n = (x * Real(-1.4426950408889634) + shift) - shift;  // rounded
-    // What remains, of at most ln 2 / 2; ln 2 in two parts, of which the first has few digits.
+    // The remainder, at most ln 2 / 2. ln 2 is split in two parts, the first with few digits.
     constexpr Real high = single ? Real(0.693359375) : Real(0.693147180369123816490);
     constexpr Real low = single ? Real(-2.12194440e-4) : Real(1.90821492927058770002e-10);
-    const Vector<Real> found = series_of_exp_minus<single ? 7 : 13, Real>((x + n * high) + n * low);
+    const Vector<Real> fraction = series_of_exp_minus<single ? 7 : 13, Real>((x + n * high) + n * low);
     using Bits = eddies::BitVector<Real>;
     const Bits power = __builtin_convertvector(n, Bits) << (single ? 23 : 52);
-    return beyond ? Vector<Real>{} : (Vector<Real>)((Bits)found + power);
+    return beyond ? Vector<Real>{} : (Vector<Real>)((Bits)fraction + power);
 }
 
 // The covariance as a function of r^2, and its first and second derivative by r^2.
@@ -85,7 +85,7 @@ template <typename Real>
 struct Covariance {
     Real slowest, amplitudes[MOST_SCALES];
     int scales;
-    bool near;  // whether no two neighbours are so far apart that the series of the widest part does not tell it
+    bool near;  // whether all distances are small enough for the series of the widest part
 
     explicit Covariance(const Kriging& k)
         : slowest(static_cast<Real>(k.slowest)), scales(static_cast<int>(k.scales)),
@@ -115,16 +115,15 @@ struct Covariance {
     }
 };
 
-// The equations of a vector of receivers: matrix and right-hand sides as rows, of which that of the matrix end on its
-// diagonal.
+// The equations of a vector of receivers: the lower triangle of the matrix and the right-hand sides, as rows.
 template <typename Real>
 class Equations {
    public:
     static constexpr int lanes = eddies::VectorOf<Real>::lanes;
 
-    // An odd number of vectors from row to row: those of one column would else fall into few sets of a cache.
+    // Rows are an odd number of vectors apart: otherwise a column would share few sets of the cache.
     explicit Equations(Int most)
-        : apart_(most | 1), places_(3 * most * lanes), noise_(most * lanes), known_(most * lanes),
+        : apart_(most | 1), places_(3 * most * lanes), noise_(most * lanes), present_(most * lanes),
           rows_((most + SIDES) * apart_ * lanes), inverse_(most * lanes) {}
 
     void solve(const Kriging& k, const Covariance<Real>& covariance, const Int* receiver, int count) {
@@ -138,17 +137,17 @@ class Equations {
 
    private:
     using V = Vector<Real>;
-    // Of a tile, whose entries, a row and a number of the other side are in registers: 32 of them, or 16.
+    // Size of a tile: its entries, a row and a number of the other side fit the 32 or 16 registers.
     static constexpr int TALL = eddies::VECTOR_BYTES == 64 ? 6 : 4, WIDE = eddies::VECTOR_BYTES == 64 ? 4 : 3;
     static_assert(SIDES % TALL > 0);
 
     V& place(Int j, int axis) { return eddies::vector_at(places_.data() + (3 * j + axis) * lanes); }
     V& noise(Int j) { return eddies::vector_at(noise_.data() + j * lanes); }
-    V& known(Int j) { return eddies::vector_at(known_.data() + j * lanes); }
+    V& present(Int j) { return eddies::vector_at(present_.data() + j * lanes); }
     V* row(Int i) { return reinterpret_cast<V*>(rows_.data() + i * apart_ * lanes); }
     V& inverse(Int j) { return eddies::vector_at(inverse_.data() + j * lanes); }
 
-    // Places relative to the receiver, its own the first. What a lane has fewer than others is 0 in `known`.
+    // Positions relative to the receiver, its own first. `present` is 0 where a lane has fewer neighbours than others.
     void read(const Kriging& k, const Int* receiver, int count) {
         const auto* displacement = static_cast<const Real*>(k.displacement);
         const Real reach = static_cast<Real>(1 / (k.support * k.support));
@@ -156,19 +155,19 @@ class Equations {
         for (int lane = 0; lane < count; ++lane)
             size_ = std::max(size_, 1 + k.offsets[receiver[lane] + 1] - k.offsets[receiver[lane]]);
         for (Int j = 0; j < size_; ++j) {
-            known(j) = noise(j) = V{};
+            present(j) = noise(j) = V{};
             for (int axis = 0; axis < 3; ++axis) place(j, axis) = V{};
         }
-        known(0) = all<Real>(k.sited ? 1 : 0);
+        present(0) = all<Real>(k.sited ? 1 : 0);
         for (int lane = 0; lane < count; ++lane) {
             const Int begin = k.offsets[receiver[lane]], neighbors = k.offsets[receiver[lane] + 1] - begin;
             for (Int j = 0; j < neighbors; ++j) {
-                known_.data()[(j + 1) * lanes + lane] = 1;
+                present_.data()[(j + 1) * lanes + lane] = 1;
                 for (int axis = 0; axis < 3; ++axis)
                     places_.data()[(3 * (j + 1) + axis) * lanes + lane] = -displacement[axis * k.pairs + begin + j];
             }
         }
-        // Neighbours come and go at the support, where their noise is 1e4 times that beside the receiver.
+        // Neighbours enter and leave at the support, where their noise is 1e4 times that beside the receiver.
         for (Int j = 0; j < size_; ++j) {
             const V q = square(j, 0) * reach, left = 1 - q * q;
             const V least = all<Real>(Real(1e-4));
@@ -184,24 +183,24 @@ class Equations {
     void fill(const Covariance<Real>& covariance, bool sited) {
         for (Int i = 0; i < size_; ++i) {
             V* entries = row(i);
-            for (Int j = 0; j < i; ++j) entries[j] = covariance(square(i, j)) * known(i);  // then j > 0 is known too
-            if (i > 0) entries[0] *= known(0);
-            entries[i] = (covariance(V{}) + noise(i)) * known(i) + (1 - known(i));
+            for (Int j = 0; j < i; ++j) entries[j] = covariance(square(i, j)) * present(i);  // then j > 0 is, too
+            if (i > 0) entries[0] *= present(0);
+            entries[i] = (covariance(V{}) + noise(i)) * present(i) + (1 - present(i));
             V first, second;
             covariance.derivatives(square(i, 0), first, second);
-            row(size_)[i] = sited ? all<Real>(i == 0) : covariance(square(i, 0)) * known(i);
-            row(size_ + FUNCTIONALS)[i] = known(i);
+            row(size_)[i] = sited ? all<Real>(i == 0) : covariance(square(i, 0)) * present(i);
+            row(size_ + FUNCTIONALS)[i] = present(i);
             // By the receiver's place x of C(|x - x_j|^2): -2 C' (x_j - x), and 4 C'' (x_j - x) (x_j - x) + 2 C' I.
-            for (int axis = 0; axis < 3; ++axis) row(size_ + 1 + axis)[i] = -2 * first * place(i, axis) * known(i);
+            for (int axis = 0; axis < 3; ++axis) row(size_ + 1 + axis)[i] = -2 * first * place(i, axis) * present(i);
             for (int q = 0; q < 6; ++q) {
                 const V twice = 4 * second * place(i, FIRST[q]) * place(i, SECOND[q]);
-                row(size_ + 4 + q)[i] = (FIRST[q] == SECOND[q] ? twice + 2 * first : twice) * known(i);
+                row(size_ + 4 + q)[i] = (FIRST[q] == SECOND[q] ? twice + 2 * first : twice) * present(i);
             }
         }
     }
 
-    // The factor L of the matrix L L^T in place, and L^-1 b in place of right-hand sides b: some rows at a time against
-    // those above, in tiles of which a register holds each entry.
+    // Cholesky factor L of the matrix L L^T in place, and L^-1 b in place of the right-hand sides b. A few rows at a
+    // time are reduced by the rows above, in tiles whose entries stay in registers.
     void factorise() {
         const Int all_rows = size_ + SIDES;
         for (Int begin = 0; begin < all_rows; begin += TALL) {
@@ -234,7 +233,7 @@ class Equations {
             for (int c = 0; c < WIDE; ++c) some[r][first + c] = sum[r][c];
     }
 
-    // One column of rows from `begin` on, of which one may end there, on its diagonal.
+    // One column of the rows from `begin` on; one of them may end there, on its diagonal.
     void column(V* const* some, int count, Int begin, Int j) {
         const V* given = row(j);
         V sum[TALL];
@@ -251,20 +250,20 @@ class Equations {
         return square;
     }
 
-    // L^-T of the right-hand sides, some columns at a time from the last on.
+    // Multiply the right-hand sides by L^-T, a few columns at a time from the last on.
     void substitute_back() {
         Int end = size_;
         for (Int begin = (size_ - 1) / WIDE * WIDE; begin >= 0; end = begin, begin -= WIDE) {
             const bool whole = end - begin == WIDE;  // all but the first to be solved
             for (int f = 0; f < SIDES; ++f) {
-                V* found = row(size_ + f);
+                V* solution = row(size_ + f);
                 for (Int k = end - 1; k >= begin; --k) {
-                    const V last = found[k] *= inverse(k);
-                    for (Int j = begin; j < k; ++j) found[j] -= row(k)[j] * last;
+                    const V last = solution[k] *= inverse(k);
+                    for (Int j = begin; j < k; ++j) solution[j] -= row(k)[j] * last;
                 }
                 if (!whole)
                     for (Int k = begin; k < end; ++k)
-                        for (Int j = 0; j < begin; ++j) found[j] -= row(k)[j] * found[k];
+                        for (Int j = 0; j < begin; ++j) solution[j] -= row(k)[j] * solution[k];
             }
             if (whole) {
                 int f = 0;
@@ -274,58 +273,58 @@ class Equations {
         }
     }
 
-    // Columns from `begin` on, which are known, off those before.
+    // Subtract the solved columns from `begin` on from the columns before.
     template <int COUNT>
     void take_off(int f, Int begin) {
-        V* found[COUNT];
+        V* solution[COUNT];
         const V* given[WIDE];
         V last[COUNT][WIDE];
         for (int c = 0; c < WIDE; ++c) given[c] = row(begin + c);
         for (int r = 0; r < COUNT; ++r) {
-            found[r] = row(size_ + f + r);
-            for (int c = 0; c < WIDE; ++c) last[r][c] = found[r][begin + c];
+            solution[r] = row(size_ + f + r);
+            for (int c = 0; c < WIDE; ++c) last[r][c] = solution[r][begin + c];
         }
         for (Int j = 0; j < begin; ++j)
             for (int r = 0; r < COUNT; ++r) {
-                V sum = found[r][j];
+                V sum = solution[r][j];
                 for (int c = 0; c < WIDE; ++c) sum -= given[c][j] * last[r][c];
-                found[r][j] = sum;
+                solution[r][j] = sum;
             }
     }
 
-    // The mean is not known: less of K^-1 1 what lets the weights of each add up to nothing; those of the field itself,
-    // where it is not known of the receiver, to one.
+    // The mean of the field is unknown. A multiple of K^-1 1 is subtracted so that the weights add up to zero, or to
+    // one for the field itself at a receiver that is not a particle.
     void leave_means(bool sited) {
         const V* ones = row(size_ + FUNCTIONALS);
         V whole{};
         for (Int j = 0; j < size_; ++j) whole += ones[j];
         for (int f = 0; f < FUNCTIONALS; ++f) {
-            V* found = row(size_ + f);
+            V* solution = row(size_ + f);
             V part = all<Real>(f == 0 && !sited ? -1 : 0);
-            for (Int j = 0; j < size_; ++j) part += found[j];
+            for (Int j = 0; j < size_; ++j) part += solution[j];
             part /= whole;
-            for (Int j = 0; j < size_; ++j) found[j] -= part * ones[j];
+            for (Int j = 0; j < size_; ++j) solution[j] -= part * ones[j];
         }
     }
 
     void write(const Kriging& k, const Int* receiver, int count) {
         auto* own = static_cast<Real*>(k.own);
         for (int f = 0; f < FUNCTIONALS; ++f) {
-            const auto* found = reinterpret_cast<const Real*>(row(size_ + f));
+            const auto* solution = reinterpret_cast<const Real*>(row(size_ + f));
             auto* weights = static_cast<Real*>(k.weights[f]);
             for (int lane = 0; lane < count; ++lane) {
                 const Int begin = k.offsets[receiver[lane]], neighbors = k.offsets[receiver[lane] + 1] - begin;
-                own[f * k.receivers + receiver[lane]] = found[lane];
-                for (Int j = 0; j < neighbors; ++j) weights[begin + j] = found[(j + 1) * lanes + lane];
+                own[f * k.receivers + receiver[lane]] = solution[lane];
+                for (Int j = 0; j < neighbors; ++j) weights[begin + j] = solution[(j + 1) * lanes + lane];
             }
         }
     }
 
     Int apart_, size_ = 0;
-    eddies::Aligned<Real> places_, noise_, known_, rows_, inverse_;
+    eddies::Aligned<Real> places_, noise_, present_, rows_, inverse_;
 };
 
-// No weights, of a receiver with too many neighbours.
+// NaN for a receiver with too many neighbours.
 template <typename Real>
 void leave_open(const Kriging& k, Int receiver) {
     constexpr Real none = std::numeric_limits<Real>::quiet_NaN();
@@ -340,7 +339,7 @@ template <typename Real>
 void solve(const Kriging& k) {
     constexpr int lanes = Equations<Real>::lanes;
     const Covariance<Real> covariance(k);
-    // Receivers with as many neighbours are solved for together.
+    // Receivers with equally many neighbours are solved together.
     std::vector<Int> order(k.receivers);
     for (Int i = 0; i < k.receivers; ++i) order[i] = i;
     const auto neighbors = [&](Int i) { return k.offsets[i + 1] - k.offsets[i]; };
@@ -372,7 +371,7 @@ inline Real sum_of_lanes(Vector<Real> numbers) {
 }
 
 template <typename Real, int ROWS>
-void tell(const Told& t) {
+void sum_weighted(const WeightedSums& t) {
     constexpr int lanes = eddies::VectorOf<Real>::lanes;
     const auto* field = static_cast<const Real*>(t.field);
     const Real *own[ROWS], *weights[ROWS];
@@ -402,13 +401,13 @@ void tell(const Told& t) {
         }
 }
 
-// All weights, those of a field and its gradient, of the gradient, or of one functional.
+// Rows: all ten; field and gradient; gradient; or one.
 template <typename Real>
-void tell(const Told& t) {
-    if (t.rows == FUNCTIONALS) tell<Real, FUNCTIONALS>(t);
-    else if (t.rows == 4) tell<Real, 4>(t);
-    else if (t.rows == 3) tell<Real, 3>(t);
-    else tell<Real, 1>(t);
+void sum_weighted(const WeightedSums& t) {
+    if (t.rows == FUNCTIONALS) sum_weighted<Real, FUNCTIONALS>(t);
+    else if (t.rows == 4) sum_weighted<Real, 4>(t);
+    else if (t.rows == 3) sum_weighted<Real, 3>(t);
+    else sum_weighted<Real, 1>(t);
 }
 
 }  // namespace
@@ -418,7 +417,7 @@ extern "C" {
 void kriging_float32(const Kriging* k) { solve<float>(*k); }
 void kriging_float64(const Kriging* k) { solve<double>(*k); }
 
-void told_float32(const Told* t) { tell<float>(*t); }
-void told_float64(const Told* t) { tell<double>(*t); }
+void weighted_sums_float32(const WeightedSums* t) { sum_weighted<float>(*t); }
+void weighted_sums_float64(const WeightedSums* t) { sum_weighted<double>(*t); }
 
 }  // extern "C"

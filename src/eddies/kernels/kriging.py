@@ -26,10 +26,10 @@ class _Sums(ctypes.Structure):
 def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.ndarray, support: float, noise: float,
                     slowest: float, amplitudes: np.ndarray,
                     sited: bool = True) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Kriging weights of the receivers' own values, (10, n), and of their neighbours' values, ten arrays (m,).
+    """Weights of the receivers' own values (10, n), and of their neighbours' values, ten arrays (m,).
 
-    Defined by `eddies.particles.kriging.kriging_weights`. NaN for a receiver with more than MOST_NEIGHBORS neighbours.
-    The ten arrays are separate so that freed ones are small enough to be kept by the allocator.
+    `eddies.particles.kriging.kriging_weights` defines them. The ten arrays are separate so that freed ones are small
+    enough to be kept by the allocator.
 
     Parameters
     ----------
@@ -39,7 +39,6 @@ def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.
     noise : variance of the part of a value that does not belong to the field.
     slowest, amplitudes : of the covariance sum_m amplitudes[m] exp(-slowest 2^m r^2), at most eight terms.
     sited : whether receivers are particles, whose own values count.
-
     """
     dtype, pairs = displacement.dtype, displacement.shape[-1]
     offsets, amplitudes = np.ascontiguousarray(offsets, np.int64), np.ascontiguousarray(amplitudes, np.float64)
@@ -56,14 +55,9 @@ def weighted_sums(library: ctypes.CDLL, offsets: np.ndarray, senders: np.ndarray
                   weights: Sequence[np.ndarray], field: np.ndarray) -> np.ndarray:
     """own_i f_i + sum_j weights_ij f_j, (n, c, rows), for one, three, four or ten rows of weights.
 
-    Parameters
-    ----------
-    offsets, senders : int64 (n + 1,) and (m,), each receiver's pairs, and their senders.
-    own, weights : rows (n,) and rows (m,); no `own` if the receivers are not particles.
-    field : (s, c), in single or double precision, as the weights are. It begins with the receivers if these are
-        particles.
-
-    Raises ValueError for arrays of another shape or type, and for arrays that are not contiguous.
+    `offsets` (n + 1,) and `senders` (m,), int64, are each receiver's pairs and their senders. `own` has rows (n,), or
+    is None if receivers are not particles; `weights` has rows (m,). `field` (s, c) begins with the receivers if these
+    are particles. Raises ValueError for arrays of another shape, type or layout.
     """
     receivers, rows, dtype, sited = len(offsets) - 1, len(weights), field.dtype, own is not None
     own = own if sited else []
@@ -78,5 +72,5 @@ def weighted_sums(library: ctypes.CDLL, offsets: np.ndarray, senders: np.ndarray
     of_own, of_weights = (np.array([address(row) for row in some], np.uint64) for some in (own, weights))
     given = _Sums(receivers, rows, field.shape[1], address(offsets), address(senders),
                   address(of_own) if sited else None, *map(address, (of_weights, field, result)))
-    getattr(library, f"told_{dtype}")(ctypes.byref(given))
+    getattr(library, f"weighted_sums_{dtype}")(ctypes.byref(given))
     return result

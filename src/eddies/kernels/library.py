@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import hashlib
+import os
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,9 @@ from eddies.errors import UserError
 INT, NUMBER, ADDRESS = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 # The same as in setup.py. A processor that runs one of them also runs all before it.
 INSTRUCTION_SETS = ("plain", "avx2", "avx512")
+# Parameters of glibc's mallopt. At most 32 MiB are taken from kept memory; larger blocks are always mapped.
+TRIM_THRESHOLD, TOP_PAD, MMAP_THRESHOLD = -1, -2, -3
+KEPT = {MMAP_THRESHOLD: 2**25, TRIM_THRESHOLD: 2**30, TOP_PAD: 2**28}
 REMEDY = ("install a C++ compiler (g++), then eddies again: `pip install --force-reinstall --no-deps .` in its sources "
           "or `bash mpi_tools/bootstrap.sh`")
 
@@ -87,6 +91,19 @@ def share_threads() -> None:
     for path in dict.fromkeys(runtimes):
         if Path(path).parent == of_wheel:
             ctypes.CDLL(path, mode=ctypes.RTLD_GLOBAL)
+
+
+def keep_freed_memory() -> None:
+    """Keep freed memory in this process instead of returning it to the system.
+
+    New pages took a sixth of a turnover of 32^3 particles with kriging. Does nothing if the user has set MALLOC_...
+    variables, or with a C library other than glibc.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is None or any(name.startswith("MALLOC_") for name in os.environ):
+        return
+    for parameter, value in KEPT.items():
+        mallopt(parameter, value)
 
 
 def members(kind: type, names: str) -> list[tuple[str, type]]:

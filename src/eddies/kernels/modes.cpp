@@ -12,13 +12,13 @@ template <typename Real>
 struct Weights {
     std::int64_t z, y, x;
     const Real *kx, *ky, *kz;
-    const Real* multiplicity;     // (x), how often a stored mode stands in the full sum
+    const Real* multiplicity;     // (x), number of times that a stored mode counts in the full sum
     const Real* inverse_squared;  // 1/k^2, 0 for k = 0
-    const Real* scale;            // of what is projected; 0 where a mode is not solved for
+    const Real* scale;            // factor of the projected vector; 0 for modes that are not solved for
     const Real* penalty;
 };
 
-// The sum of function(z, y, where the line starts in an array of weights) over all lines.
+// Sum of function(z, y, start of the line in an array of weights) over all lines.
 template <typename Real, typename Function>
 double sum_over_lines(const Weights<Real>& weights, const Function& function) {
     std::vector<double> sums(weights.z);
@@ -63,10 +63,10 @@ double image_of(const Weights<Real>& w, const Real* given, const Real* modes, Re
     });
 }
 
-// found += length direction, residual -= length image; the local sum of inverse times the residual squared.
+// solution += length direction, residual -= length image; the local sum of inverse times the residual squared.
 template <typename Real>
 double descend(const Weights<Real>& w, Real length, const Real* inverse, const Real* direction, const Real* image,
-               Real* found, Real* residual) {
+               Real* solution, Real* residual) {
     const std::int64_t size = 2 * w.z * w.y * w.x;
     return sum_over_lines(w, [&](std::int64_t, std::int64_t, std::int64_t start) {
         double sum = 0.0;
@@ -76,8 +76,8 @@ double descend(const Weights<Real>& w, Real length, const Real* inverse, const R
             for (std::int64_t x = 0; x < w.x; ++x) {
                 const std::int64_t i = first + 2 * x;
                 const Real real = residual[i] - length * image[i], imaginary = residual[i + 1] - length * image[i + 1];
-                found[i] += length * direction[i];
-                found[i + 1] += length * direction[i + 1];
+                solution[i] += length * direction[i];
+                solution[i + 1] += length * direction[i + 1];
                 residual[i] = real;
                 residual[i + 1] = imaginary;
                 sum += w.multiplicity[x] * inverse[start + x] * (real * real + imaginary * imaginary);
@@ -110,8 +110,8 @@ void turn(const Weights<Real>& w, Real share, const Real* inverse, const Real* r
         return image_of(*weights, given, modes, image);                                                                \
     }                                                                                                                  \
     double modes_descend_##name(const Weights<Real>* weights, double length, const Real* inverse,                      \
-                                const Real* direction, const Real* image, Real* found, Real* residual) {               \
-        return descend(*weights, static_cast<Real>(length), inverse, direction, image, found, residual);               \
+                                const Real* direction, const Real* image, Real* solution, Real* residual) {            \
+        return descend(*weights, static_cast<Real>(length), inverse, direction, image, solution, residual);            \
     }                                                                                                                  \
     void modes_turn_##name(const Weights<Real>* weights, double share, const Real* inverse, const Real* residual,      \
                            Real* direction) {                                                                          \

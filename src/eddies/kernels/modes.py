@@ -41,10 +41,10 @@ class ModePasses:
         image = np.empty_like(modes)
         return image, self._call("modes_image", ctypes.c_double, [], [given, modes, image])
 
-    def descend(self, length: float, inverse: np.ndarray, direction: np.ndarray, image: np.ndarray, found: np.ndarray,
-                residual: np.ndarray) -> float:
-        """found += length direction, residual -= length image; returns <residual, inverse residual>."""
-        return self._call("modes_descend", ctypes.c_double, [length, inverse], [direction, image, found, residual])
+    def descend(self, length: float, inverse: np.ndarray, direction: np.ndarray, image: np.ndarray,
+                solution: np.ndarray, residual: np.ndarray) -> float:
+        """solution += length direction, residual -= length image; returns <residual, inverse residual>."""
+        return self._call("modes_descend", ctypes.c_double, [length, inverse], [direction, image, solution, residual])
 
     def turn(self, share: float, inverse: np.ndarray, residual: np.ndarray, direction: np.ndarray) -> None:
         """direction = inverse residual + share direction."""

@@ -1,5 +1,5 @@
-// Moving least squares: at each receiver the polynomial of first or second degree that fits what particles around it
-// carry best, with a smoothing kernel as weight; `ParticleField.fitted` in particles/particle_field.py has the equation.
+// Moving least squares: the polynomial of first or second degree that best fits the values of the particles around a
+// receiver, weighted by a smoothing kernel. `ParticleField.fitted` in particles/particle_field.py has the equation.
 
 #include <algorithm>
 #include <cmath>
@@ -15,8 +15,8 @@ struct Fit {
     std::int64_t receivers, periodic_z;
     double length, volume, ridge;     // edge of the box; mean volume of a particle; see the definition
     const std::int64_t *offsets, *senders;
-    const double *receiver, *position, *value, *kernel;  // (receivers, 3), (s, 3) twice, and as smoothing.hpp wants it
-    double *found;                    // (receivers, 4, 3): value, and its derivatives by x, y and z
+    const double *receiver, *position, *value, *kernel;  // (receivers, 3), (s, 3), (s, 3); kernel: see smoothing.hpp
+    double *result;                   // (receivers, 4, 3): value, and its derivatives by x, y and z
 };
 
 }  // extern "C"
@@ -29,12 +29,12 @@ constexpr int lanes = eddies::VectorOf<double>::lanes;
 
 // 1, x, y, z and, of the second degree, xx, xy, xz, yy, yz, zz.
 template <int SIZE>
-void monomials(const V* x, V* found) {
-    found[0] = V{} + 1;
-    for (int axis = 0; axis < 3; ++axis) found[1 + axis] = x[axis];
+void monomials(const V* x, V* terms) {
+    terms[0] = V{} + 1;
+    for (int axis = 0; axis < 3; ++axis) terms[1 + axis] = x[axis];
     if constexpr (SIZE > 4)
         for (int i = 0, k = 4; i < 3; ++i)
-            for (int j = i; j < 3; ++j) found[k++] = x[i] * x[j];
+            for (int j = i; j < 3; ++j) terms[k++] = x[i] * x[j];
 }
 
 double sum_of_lanes(V numbers) {
@@ -51,14 +51,14 @@ class Normal {
 
     void solve(Int receiver) {
         sum_up(receiver);
-        double* found = f_.found + 12 * receiver;
+        double* result = f_.result + 12 * receiver;
         if (!factorise()) {
-            std::fill_n(found, 12, 0.0);
+            std::fill_n(result, 12, 0.0);
             return;
         }
         for (int c = 0; c < 3; ++c) {
             substitute(right_[c]);
-            for (int k = 0; k < 4; ++k) found[3 * k + c] = right_[c][k] / (k ? reach_ : 1.0);
+            for (int k = 0; k < 4; ++k) result[3 * k + c] = right_[c][k] / (k ? reach_ : 1.0);
         }
     }
 
@@ -94,8 +94,7 @@ class Normal {
         }
     }
 
-    // Of some neighbours, nearest images from the receiver to them and what they carry; lanes without one are beyond
-    // the kernel's support.
+    // Displacements and values of a vector of neighbours. Lanes without a neighbour get a distance beyond the support.
     void read(Int receiver, Int pair, Int count, V* x, V* value) const {
         for (int lane = 0; lane < lanes; ++lane) {
             const Int sender = f_.senders[lane < count ? pair + lane : pair];
@@ -108,7 +107,7 @@ class Normal {
         }
     }
 
-    // Cholesky's factor in place; whether there is one, as there is where a weight is not zero and a ridge is given.
+    // Cholesky factor in place. It exists if a weight is not zero and there is a ridge; returns whether it does.
     bool factorise() {
         for (int j = 0; j < SIZE; ++j) {
             for (int k = 0; k < j; ++k) matrix_[j][j] -= matrix_[j][k] * matrix_[j][k];

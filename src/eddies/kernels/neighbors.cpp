@@ -1,4 +1,4 @@
-// Lists of the pairs of points within a radius, and what lies between the points of listed pairs.
+// Lists of the pairs of points within a radius, and displacements and distances of listed pairs.
 
 #include <memory>
 
@@ -17,17 +17,17 @@ struct Search {
     std::int64_t* offsets;      // (receivers + 1), where the senders of each begin
 };
 
-// The pairs of a list that are within a radius now, for the receivers `rows` (count). Outputs are given in the second of
-// two calls.
+// The pairs of a list that are within a radius now, for the receivers `rows` (count). Outputs are given in the second
+// of two calls.
 struct Listed {
     std::int64_t count;
-    const std::int64_t *rows, *offsets, *sender;
+    const std::int64_t *rows, *offsets, *listed;
     const double *receivers, *positions;
     double length;
     std::int64_t periodic_z;
     double radius;
     std::int64_t* first;        // (count + 1), where the pairs of each row begin
-    std::int64_t *receiver, *segment, *found;
+    std::int64_t *receiver, *segment, *sender;
     void *displacement, *distance;  // (3, pairs) and (pairs)
 };
 
@@ -37,23 +37,23 @@ namespace {
 
 using namespace eddies;
 
-constexpr std::int64_t RECEIVERS = 512;  // of one thread together
+constexpr std::int64_t RECEIVERS = 512;  // in a task of a thread
 
 using List = std::vector<std::vector<std::int32_t>>;
 
 // Numbers of the senders of consecutive receivers.
 void find(const Search& search, const Cells<double>& cells, std::int64_t begin, std::int64_t end,
-          std::vector<std::int32_t>& found) {
+          std::vector<std::int32_t>& senders) {
     const double limit = search.radius * search.radius;
     std::vector<NearRow> near;
-    std::int64_t known = -1;
+    std::int64_t last_row = -1;
     Edges edges[2];
     Range ranges[2];
     for (std::int64_t i = begin; i < end; ++i) {
         const auto place = cells.place(search.receiver + 3 * i);
-        if (place.row(cells) != known) cells.near(known = place.row(cells), near);
+        if (place.row(cells) != last_row) cells.near(last_row = place.row(cells), near);
         cells.edges(place, edges);
-        const std::size_t before = found.size();
+        const std::size_t before = senders.size();
         for (const NearRow& row : near) {
             const int number = cells.within(place.fraction[0], edges, row, search.radius, ranges);
             for (int r = 0; r < number; ++r)
@@ -61,11 +61,11 @@ void find(const Search& search, const Cells<double>& cells, std::int64_t begin, 
                     const int some = static_cast<int>(std::min<std::int64_t>(CANDIDATES, ranges[r].last - at));
                     for (auto near = cells.nearer(place.fraction, at, some, limit); near; near &= near - 1) {
                         const std::int32_t j = cells.order[at + __builtin_ctzll(near)];
-                        if (!search.exclude_self || j != i) found.push_back(j);
+                        if (!search.exclude_self || j != i) senders.push_back(j);
                     }
                 }
         }
-        search.offsets[i + 1] = static_cast<std::int64_t>(found.size() - before);
+        search.offsets[i + 1] = static_cast<std::int64_t>(senders.size() - before);
     }
 }
 
@@ -74,15 +74,15 @@ struct Between {
 };
 
 inline Between between(const Listed& list, const double* own, const double* other) {
-    Between found;
-    found.square = 0.0;
+    Between apart;
+    apart.square = 0.0;
     for (int axis = 0; axis < 3; ++axis) {
         double d = own[axis] - other[axis];
         if (axis < 2 || list.periodic_z) d -= list.length * std::nearbyint(d / list.length);
-        found.x[axis] = d;
-        found.square += d * d;
+        apart.x[axis] = d;
+        apart.square += d * d;
     }
-    return found;
+    return apart;
 }
 
 template <typename Visit>
@@ -90,9 +90,9 @@ inline void each_pair(const Listed& list, std::int64_t row, const Visit& visit) 
     const std::int64_t i = list.rows[row];
     const double limit = list.radius * list.radius;
     for (std::int64_t at = list.offsets[i]; at < list.offsets[i + 1]; ++at) {
-        const std::int64_t j = list.sender[at];
-        const Between found = between(list, list.receivers + 3 * i, list.positions + 3 * j);
-        if (found.square < limit) visit(i, j, found);
+        const std::int64_t j = list.listed[at];
+        const Between apart = between(list, list.receivers + 3 * i, list.positions + 3 * j);
+        if (apart.square < limit) visit(i, j, apart);
     }
 }
 
@@ -103,13 +103,13 @@ void fill(const Listed& list) {
 #pragma omp parallel for schedule(static)
     for (std::int64_t row = 0; row < list.count; ++row) {
         std::int64_t at = list.first[row];
-        each_pair(list, row, [&](std::int64_t i, std::int64_t j, const Between& found) {
+        each_pair(list, row, [&](std::int64_t i, std::int64_t j, const Between& apart) {
             list.receiver[at] = i;
             list.segment[at] = row;
-            list.found[at] = j;
+            list.sender[at] = j;
             Real square = 0;
             for (int axis = 0; axis < 3; ++axis) {
-                const Real x = static_cast<Real>(found.x[axis]);
+                const Real x = static_cast<Real>(apart.x[axis]);
                 displacement[axis * pairs + at] = x;
                 square += x * x;
             }

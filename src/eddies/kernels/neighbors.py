@@ -25,9 +25,9 @@ class _Search(ctypes.Structure):
 
 
 class _Listed(ctypes.Structure):
-    _fields_ = (members(INT, "count") + members(ADDRESS, "rows offsets sender receivers positions")
+    _fields_ = (members(INT, "count") + members(ADDRESS, "rows offsets listed receivers positions")
                 + members(NUMBER, "length") + members(INT, "periodic_z") + members(NUMBER, "radius")
-                + members(ADDRESS, "first receiver segment found displacement distance"))
+                + members(ADDRESS, "first receiver segment sender displacement distance"))
 
 
 def neighbors_within(library: ctypes.CDLL, box: Box, radius: float, receivers: np.ndarray, senders: np.ndarray,
@@ -42,9 +42,9 @@ def neighbors_within(library: ctypes.CDLL, box: Box, radius: float, receivers: n
                      radius, exclude_self, address(offsets))
     library.neighbors_find.restype = ctypes.c_void_p
     handle = library.neighbors_find(ctypes.byref(search))
-    found = np.empty(offsets[-1], np.int64)
-    library.neighbors_take(ctypes.c_void_p(handle), ctypes.c_void_p(address(found)))
-    return offsets, found
+    rows = np.empty(offsets[-1], np.int64)
+    library.neighbors_take(ctypes.c_void_p(handle), ctypes.c_void_p(address(rows)))
+    return offsets, rows
 
 
 def pairs_within(library: ctypes.CDLL, box: Box, radius: float, receivers: np.ndarray, senders: np.ndarray,
@@ -60,7 +60,7 @@ def pairs_within(library: ctypes.CDLL, box: Box, radius: float, receivers: np.nd
     library.neighbors_count(ctypes.byref(given))
     indices, count = np.empty((3, first[-1]), np.int64), first[-1]
     displacement, distance = np.empty((3, count), kind), np.empty(count, kind)
-    given.receiver, given.segment, given.found = map(address, indices)
+    given.receiver, given.segment, given.sender = map(address, indices)
     given.displacement, given.distance = address(displacement), address(distance)
     getattr(library, f"neighbors_fill_{np.dtype(kind)}")(ctypes.byref(given))
     return *indices, displacement, distance

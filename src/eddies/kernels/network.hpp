@@ -21,16 +21,16 @@ inline V series(const Real (&coefficients)[terms], V x) {
     return sum;
 }
 
-// What the numbers of a tanh layer are multiplied by before `tanh_of` takes them.
+// Factor of the arguments of a tanh layer before `tanh_of`.
 template <typename Real>
 constexpr double TANH_UNIT = 1.0;
 
-// Vectors of which `tanh_of` takes each step together, as one alone would wait for each.
+// Vectors that `tanh_of` processes together, so that one does not wait for the result of each step.
 constexpr int TOGETHER = 4;
 
 // tanh(x) of y = x TANH_UNIT as y P(y^2) / Q(y^2), a minimax fit up to x = 8, and beyond as there; to 4e-7, and 6e-7
 // with round-off. In that unit the highest powers of both have the factor 1, which saves a product each. Two vectors
-// share a division: what is not a number in a lane of one is not one in the other either.
+// share a division, and so NaN in a lane of one becomes NaN in the other.
 template <>
 constexpr double TANH_UNIT<float> = 0.021518350198783773;
 
@@ -90,7 +90,7 @@ constexpr int TILE_VECTORS = 1, MOST_ROWS = 4;
 template <typename Real>
 constexpr int TILE = TILE_VECTORS * VectorOf<Real>::lanes;
 
-// Calls `use` with a size, which is known to the compiler.
+// Call `use` with a size as a constant of the compiler.
 template <int most, typename Use>
 inline void with_size(int size, const Use& use) {
     if constexpr (most > 1)
@@ -98,7 +98,7 @@ inline void with_size(int size, const Use& use) {
     use(std::integral_constant<int, most>());
 }
 
-// Calls `use` with size and first of groups of at most `most` things, which are as large as each other, or nearly so.
+// Call `use` with the size and the first member of about equally large groups of at most `most` members.
 template <int most, typename Use>
 inline void in_groups(int count, const Use& use) {
     int first = 0;
@@ -109,7 +109,7 @@ inline void in_groups(int count, const Use& use) {
     }
 }
 
-// Rows of a tile, so many numbers apart.
+// Rows of a tile, with the distance between them.
 template <typename Real>
 struct TileRows {
     Real* first;
@@ -130,7 +130,7 @@ class Matrix {
         });
     }
 
-    // Its product with rows of a tile, added to biases unless they are null.
+    // Product with the rows of a tile, plus biases unless these are null.
     void multiply(const Real* biases, TileRows<const Real> given, TileRows<Real> result) const {
         in_groups<MOST_ROWS>(outputs_, [&](auto rows, int first) {
             multiply_rows<rows>(numbers_.data() + first * inputs_, biases ? biases + first : nullptr, given,
@@ -172,7 +172,7 @@ class Matrix {
 template <typename Real>
 class Network {
    public:
-    // Throws std::invalid_argument where the count is another than that of the parameters.
+    // Throws std::invalid_argument if the number of parameters is wrong.
     Network(std::vector<int> widths, const double* parameters, std::int64_t count) : widths_(std::move(widths)) {
         for (int layer = 0; layer < layers(); ++layer) count -= (widths_[layer] + 1) * widths_[layer + 1];
         if (count != 0) throw std::invalid_argument("parameters of a network");
@@ -191,10 +191,10 @@ class Network {
         }
     }
 
-    // Where the features of the points are expected, and where the gradient by them is found.
+    // Memory of the features of the points, and of the gradient by them.
     Rows<Real>& features() { return values_.front(); }
     const Rows<Real>& by_features() const { return deltas_.front(); }
-    // Likewise of the outputs.
+    // The same for the outputs.
     const Rows<Real>& outputs() const { return values_.back(); }
     Rows<Real>& by_outputs() { return deltas_.back(); }
 
@@ -209,7 +209,7 @@ class Network {
             }
     }
 
-    // After `forward`: from the gradient by outputs those by parameters, added to a vector for each, and by features.
+    // After `forward`: gradients by parameters (added, a vector for each) and by features, from those by outputs.
     void backward(Real* by_parameters, bool features_too) {
         constexpr int lanes = VectorOf<Real>::lanes;
         for (int layer = 0; layer < layers(); ++layer)
@@ -237,10 +237,10 @@ class Network {
 
     int layers() const { return static_cast<int>(widths_.size()) - 1; }
 
-    // Rows of a tile: so many that tanh is taken of whole ones; those beyond the width are zero, as tanh leaves them.
+    // Number of rows of a tile, rounded up for tanh; rows beyond the width stay zero.
     static int held(int width) { return (width + TOGETHER - 1) / TOGETHER * TOGETHER; }
 
-    // Rows of all tiles: how far a row is from the one before, and a tile.
+    // Distances between rows and between tiles.
     struct BlockRows {
         const Real* first;
         std::ptrdiff_t apart, next;
@@ -252,13 +252,13 @@ class Network {
         return {first.first, first.apart, tile(rows, layer, TILE<Real>).first - first.first};
     }
 
-    // The rows of a tile that begins with point `p`.
+    // The rows of the tile whose first point is `p`.
     TileRows<Real> tile(std::vector<Rows<Real>>& rows, int layer, int p) const {
         if (layer == 0 || layer == layers()) return {rows[layer][0] + p, BLOCK};
         return {rows[layer][0] + p * held(widths_[layer]), TILE<Real>};
     }
 
-    // Adds what a block's points give to the gradient by weights and biases of a layer.
+    // Add the contribution of a block to the gradient by weights and biases of a layer.
     void add_by_parameters(int layer, Real* by_parameters) {
         constexpr int lanes = VectorOf<Real>::lanes;
         const int inputs = widths_[layer], outputs = widths_[layer + 1];

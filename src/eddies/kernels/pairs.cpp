@@ -1,25 +1,25 @@
 // Sums over pairs of particles within a radius, and the gradients that go back through them.
 //
-// Each evaluation puts the particles in order of place, finds the pairs and takes them BLOCK at a time, so that nothing
-// is ever stored for a pair. A pair is found once, from the row of cells that comes first; what it gives goes to both
-// particles. Rows of one colour have no target in common: threads share them, and every particle gets its contributions
-// in the same order whatever their number.
+// Each evaluation sorts the particles by place, searches the pairs and processes them in blocks of BLOCK, so that
+// nothing is stored for a pair. A pair is found once, from the first of its two rows of cells, and contributes to both
+// particles. Rows of one colour have no target in common and are shared by threads. Every particle gets its
+// contributions in the same order for any number of threads.
 
 #include "cells.hpp"
 #include "summands.hpp"
 
 extern "C" {
 
-// What pairs are made of; kernels/pairs.py has the same structures.
+// Particles and their columns; kernels/pairs.py has the same structures.
 struct Particles {
     std::int64_t count, scalars;
     const double *position, *velocity;  // (count, 3)
     const double* scalar;               // (scalars, count)
-    const std::uint8_t* wanted;         // (count), whether its sums are asked for
+    const std::uint8_t* wanted;         // (count), whether its sums are requested
     double length;
     std::int64_t periodic_z;
     double radius, length_unit, velocity_unit;
-    std::int64_t mutual;                // whether all summands are, and each pair is evaluated once
+    std::int64_t mutual;                // whether all summands are mutual, so that each pair is evaluated once
 };
 
 struct Gradients {
@@ -35,7 +35,7 @@ using namespace eddies;
 
 constexpr int ROWS_TOGETHER = 4;  // of a colour, for one thread
 
-// The results of calls: else the first particle whose position is not finite.
+// Results of calls. Any other result is the number of the first particle whose position is not finite.
 constexpr std::int64_t DONE = -1, UNKNOWN = -2, NO_GRADIENT = -3;
 
 template <typename Real>
@@ -45,7 +45,7 @@ std::unique_ptr<Summand<Real>> summand(const Given& given) {
     else return kind.full(given);
 }
 
-// Whether all kinds of summands are known, and what is given is what they want; DONE, or what is wrong.
+// Check the kinds of the summands and their arguments: DONE, or an error.
 std::int64_t check(const Particles& particles, std::int64_t number, const Given* given, bool gradients) try {
     for (std::int64_t s = 0; s < number; ++s) {
         const auto one = summand<double>(given[s]);
@@ -59,14 +59,14 @@ std::int64_t check(const Particles& particles, std::int64_t number, const Given*
     return UNKNOWN;
 }
 
-// A bit for each of some things.
+// A set of bits.
 class Bits {
    public:
     explicit Bits(std::int64_t count) : words_(count / 64 + 2) {}
     void set(std::int64_t number) { words_[number / 64] |= std::uint64_t(1) << number % 64; }
     bool operator[](std::int64_t number) const { return words_[number / 64] >> number % 64 & 1; }
 
-    // The 64 that begin with one of them.
+    // 64 bits from a position on.
     std::uint64_t from(std::int64_t number) const {
         const std::uint64_t *word = &words_[number / 64], shift = number % 64;
         return word[0] >> shift | (word[1] << 1) << (63 - shift);
@@ -76,8 +76,7 @@ class Bits {
     std::vector<std::uint64_t> words_;
 };
 
-// The particles in order of place, each with a record of what it carries in the units of the summands: the bits of its
-// turns, velocity, scalars.
+// The sorted particles, each with a record in the units of the summands: bits of its turns, velocity, scalars.
 template <typename Real>
 struct Sorted {
     const Particles& given;
@@ -113,7 +112,7 @@ struct Sorted {
     }
 
    private:
-    // Each row gets the first colour that no row has whose targets it shares.
+    // Each row gets the first colour without a row that shares a target.
     void colour_rows() {
         std::vector<std::vector<std::int64_t>> sources(cells.rows());  // colours that have each row as a target
         std::vector<NearRow> near;
@@ -122,9 +121,9 @@ struct Sorted {
             std::size_t colour = 0;
             const auto taken = [&](std::size_t candidate) {
                 return std::any_of(near.begin(), near.end(), [&](const NearRow& target) {
-                    const auto& found = sources[target.row];
+                    const auto& used = sources[target.row];
                     return target.row >= row &&
-                           std::find(found.begin(), found.end(), std::int64_t(candidate)) != found.end();
+                           std::find(used.begin(), used.end(), std::int64_t(candidate)) != used.end();
                 });
             };
             while (taken(colour)) ++colour;
@@ -141,7 +140,7 @@ struct Queue {
     int count = 0;
     std::int32_t first[BLOCK + 2 * CANDIDATES], second[BLOCK + 2 * CANDIDATES];
 
-    // Add a particle and those of consecutive others whose bit is set; or them and it.
+    // Add pairs of a particle with those of consecutive others whose bit is set, in this order or reversed.
     void add(std::int64_t i, std::int64_t begin, std::uint64_t others, bool turned) {
         if (!others) return;
         const int number = __builtin_popcountll(others);
@@ -152,20 +151,20 @@ struct Queue {
 };
 
 int components_of(std::int64_t number, const Given* given) {
-    std::int64_t found = 0;
-    for (std::int64_t s = 0; s < number; ++s) found += given[s].components;
-    return static_cast<int>(found);
+    std::int64_t sum = 0;
+    for (std::int64_t s = 0; s < number; ++s) sum += given[s].components;
+    return static_cast<int>(sum);
 }
 
-// What one thread does to the rows that it gets.
+// The work of one thread on its rows.
 template <typename Real>
 class Worker {
    public:
     std::vector<std::unique_ptr<Summand<Real>>> summands;
     std::vector<Aligned<Real>> by_parameters;  // a vector for each
 
-    // `results` (count, width) in order of place are added to: sums, or where their gradients `by_sums` (count, width
-    // of sums) are given, those by position, velocity and scalars, unless null.
+    // Adds to `results` (count, width) of the sorted particles: the sums or, if their gradients `by_sums` (count, width
+    // of sums) are given, the gradients by position, velocity and scalars, unless null.
     Worker(const Sorted<Real>& sorted, std::int64_t number, const Given* given, Real* results, const Real* by_sums)
         : given_(given), sorted_(sorted), cells_(sorted.cells), results_(results), by_sums_(by_sums),
           by_pairs_(sorted.width), first_(sorted.width), second_(sorted.width),
@@ -181,7 +180,7 @@ class Worker {
         inverse_square_ = 1 / (scaled * scaled);
     }
 
-    // Take all pairs that are found from a row.
+    // Process all pairs of a row.
     void row(std::int64_t row) {
         const Range own = cells_.of_row(row);
         cells_.near(row, near_);
@@ -200,7 +199,7 @@ class Worker {
         }
     }
 
-    // Take what is left.
+    // Process the remaining pairs.
     void finish() {
         take(both_, both_.count, true);
         take(one_, one_.count, false);
@@ -217,25 +216,25 @@ class Worker {
     Real unit_, inverse_square_;
     std::vector<NearRow> near_;
     std::vector<Columns> columns_;
-    Queue both_, one_;  // pairs whose particles are both wanted, or the first alone
+    Queue both_, one_;  // pairs with both particles wanted, or only the first
     Block<Real> pairs_, swapped_;
     ByPairs<Real> by_pairs_;
-    Rows<Real> first_, second_;  // what the particles of pairs carry
+    Rows<Real> first_, second_;  // records of the particles of pairs
     int width_;                  // of the record of a particle's sums
     Rows<Real> sums_, others_;
 
-    // Look for neighbours of a particle among a range.
+    // Search neighbours of a particle in a range.
     void look(std::int64_t i, std::int64_t first, std::int64_t last) {
         const auto limit = static_cast<Real>(radius_ * radius_);
         const bool wanted = sorted_.wanted[i];
         const typename Cells<Real>::Turn at[3] = {cells_.turn[0][i], cells_.turn[1][i], cells_.turn[2][i]};
         for (std::int64_t begin = first; begin < last; begin += CANDIDATES) {
-            const std::uint64_t asked = sorted_.wanted.from(begin);
-            if (!wanted && !asked) continue;
+            const std::uint64_t others = sorted_.wanted.from(begin);
+            if (!wanted && !others) continue;
             const int number = static_cast<int>(std::min<std::int64_t>(CANDIDATES, last - begin));
             const std::uint64_t near = cells_.nearer(at, begin, number, limit);
-            (wanted ? both_ : one_).add(i, begin, near & asked, !wanted);
-            if (wanted) one_.add(i, begin, near & ~asked, false);
+            (wanted ? both_ : one_).add(i, begin, near & others, !wanted);
+            if (wanted) one_.add(i, begin, near & ~others, false);
             take_blocks(both_, true);
             take_blocks(one_, false);
         }
@@ -249,12 +248,12 @@ class Worker {
         std::memmove(queue.second, queue.second + BLOCK, queue.count * sizeof(*queue.second));
     }
 
-    // Evaluate the first pairs of a queue, `count` of them, and add what they give: to the first particles, and to the
-    // second ones where they are wanted too.
+    // Evaluate the first `count` pairs of a queue. Add the values to the first particles, and to the second ones if
+    // these are wanted too.
     void take(Queue& queue, int count, bool both) {
         if (count == 0) return;
         std::int32_t *first = queue.first, *second = queue.second;
-        for (int p = count; p < BLOCK; ++p) {  // a lane that counts for nothing
+        for (int p = count; p < BLOCK; ++p) {  // unused lanes
             first[p] = first[0];
             second[p] = second[0];
         }
@@ -282,7 +281,7 @@ class Worker {
         }
     }
 
-    // What second particles get of mutual summands.
+    // Contributions of mutual summands to the second particles.
     void turn_sums() {
         int column = 0;
         for (std::size_t s = 0; s < summands.size(); ++s)
@@ -293,7 +292,7 @@ class Worker {
             }
     }
 
-    // What pairs carry.
+    // Quantities of pairs.
     void make_pairs(const std::int32_t* first, const std::int32_t* second) {
         using V = Vector<Real>;
         gather(sorted_.records.data(), sorted_.width, first, first_[0]);
@@ -323,7 +322,7 @@ class Worker {
         return *reinterpret_cast<const Vector<Real>*>(rows[row] + p);
     }
 
-    // The same pairs with second and first particle in each other's place.
+    // The same pairs with exchanged particles.
     const Block<Real>& swapped() {
         for (int axis = 0; axis < 3; ++axis)
 #pragma omp simd
@@ -340,7 +339,7 @@ class Worker {
         return swapped_;
     }
 
-    // Gradients of what a block gives to its first particles, and to the second ones if `mutual`.
+    // Gradients of the contributions of a block to its first particles, and to the second ones if `mutual`.
     void take_back(const Block<Real>& pairs, const std::int32_t* first, const std::int32_t* second, int count,
                    bool mutual) {
         gather(by_sums_, width_, first, sums_[0]);
@@ -385,7 +384,7 @@ class Worker {
     }
 };
 
-// Let workers take all pairs; `results` as they want them. What belongs to parameters is summed by tasks, in order.
+// Let workers process all pairs; `results` as in Worker. Gradients by parameters are summed over tasks in order.
 template <typename Real>
 void take_all(const Sorted<Real>& sorted, std::int64_t number, const Given* given, Real* results, const Real* by_sums) {
     struct Task {
@@ -474,13 +473,13 @@ std::int64_t gradients(const Particles& particles, std::int64_t number, const Gi
     take_all<Real>(sorted, number, given, by.position ? results.data() : nullptr, by_sums.data());
     if (!by.position) return DONE;
     for (std::int64_t p = 0; p < particles.count; ++p) {
-        const Real* found = results.data() + p * sorted.width;
+        const Real* record = results.data() + p * sorted.width;
         const std::int64_t row = sorted.cells.order[p];
         for (int axis = 0; axis < 3; ++axis) {
-            by.position[3 * row + axis] = found[axis];
-            by.velocity[3 * row + axis] = found[3 + axis] / particles.velocity_unit;
+            by.position[3 * row + axis] = record[axis];
+            by.velocity[3 * row + axis] = record[3 + axis] / particles.velocity_unit;
         }
-        for (std::int64_t s = 0; s < particles.scalars; ++s) by.scalar[s * particles.count + row] = found[6 + s];
+        for (std::int64_t s = 0; s < particles.scalars; ++s) by.scalar[s * particles.count + row] = record[6 + s];
     }
     return DONE;
 }
@@ -495,7 +494,7 @@ const char* pair_summand(std::int64_t number) {
     return std::next(kinds().begin(), number)->first.c_str();
 }
 
-// Sums of all summands; DONE, or what is wrong, and then nothing is found.
+// Sums of all summands; returns DONE or an error, and then no sums.
 
 std::int64_t pair_sums_float32(const Particles* particles, std::int64_t number, const Given* given) {
     return sums<float>(*particles, number, given);
@@ -505,8 +504,8 @@ std::int64_t pair_sums_float64(const Particles* particles, std::int64_t number, 
     return sums<double>(*particles, number, given);
 }
 
-// Gradients by parameters, and unless `by` holds nulls by what the particles carry, from those by sums, which are zero
-// where none are wanted.
+// Gradients by parameters and, unless `by` holds null pointers, by the columns of the particles, from those by sums,
+// which are zero at particles that are not wanted.
 
 std::int64_t pair_gradients_float32(const Particles* particles, std::int64_t number, const Given* given,
                                     const Gradients* by) {

@@ -17,13 +17,10 @@ DONE, UNKNOWN, NO_GRADIENT = -1, -2, -3
 
 @dataclass(frozen=True)
 class Summand:
-    """A quantity to sum over pairs.
+    """A quantity to sum over pairs, by its name `kind` and its constants `numbers` in summands.hpp.
 
-    Parameters
-    ----------
-    kind : its name in summands.hpp. numbers : its constants there.
-    parity : (components,); the second particle of a mutual pair gets the first one's value times this.
-    scalar : index of the first column of scalars that it reads.
+    The second particle of a mutual pair gets the first one's value times `parity` (components,). `scalar` is the first
+    column of scalars that it reads.
     """
 
     kind: str
@@ -43,14 +40,9 @@ def kinds(library: ctypes.CDLL) -> list[str]:
 
 @dataclass(frozen=True)
 class PairSpace:
-    """The box of the pairs and their units.
+    """The box of the pairs, the distance `radius` within which two particles are a pair, and the units of the summands.
 
-    Parameters
-    ----------
-    length, periodic_z : edge of the box, and whether it is periodic along z.
-    radius : distance within which two particles are a pair.
-    length_unit, velocity_unit : units of the summands.
-    mutual : whether each pair is evaluated once, for both particles.
+    With `mutual` each pair is evaluated once, for both particles.
     """
 
     length: float
@@ -73,14 +65,9 @@ class _Given(ctypes.Structure):
 
 
 class CompiledPairs:
-    """Particles, and sums over their pairs for the `wanted` ones.
+    """Particles, and sums over their pairs for the `wanted` ones, bool (n,), in the precision `kind`.
 
-    Parameters
-    ----------
-    position, velocity : (n, 3).
-    scalars : (k, n), at most MOST_SCALARS columns, in the units of the summands.
-    wanted : bool (n,).
-    kind : float32 or float64, of the arithmetic.
+    `position` and `velocity` are (n, 3), `scalars` (k, n) at most MOST_SCALARS columns in the units of the summands.
     """
 
     def __init__(self, library: ctypes.CDLL, space: PairSpace, position: np.ndarray, velocity: np.ndarray,

@@ -1,4 +1,4 @@
-// What the library has been built for more than once: instruction sets, told apart where it is loaded.
+// Instruction sets: the library is built for several, and the best one is loaded.
 
 extern "C" {
 
@@ -15,7 +15,7 @@ int best_instruction_set() {
 #endif
 }
 
-// The SHA-256 of the sources that it was built from.
+// SHA-256 of the sources of this library.
 const char* kernel_sources() { return EDDIES_SOURCES; }
 
 }  // extern "C"

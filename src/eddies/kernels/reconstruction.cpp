@@ -9,12 +9,12 @@
 
 extern "C" {
 
-// Particles, and those planes of a periodic grid of `cells`^2 points a plane, `spacing` apart, that a rank has;
+// Particles, and a rank's planes of a periodic grid with `cells`^2 points in a plane, `spacing` apart.
 // kernels/reconstruction.py has the same structure.
 struct Reconstruction {
     std::int64_t particles, cells, first_plane, planes, periodic_z;
     double spacing, support;
-    const double *position, *kernel;  // (particles, 3), and as smoothing.hpp wants it
+    const double *position, *kernel;  // (particles, 3); kernel: see smoothing.hpp
     const void* columns;              // (particles, 4), each to be added with the weight W
     void* sums;                       // (planes, cells, cells, 4)
 };
@@ -25,8 +25,8 @@ namespace {
 
 using eddies::Vector;
 
-// A plane's sums while particles are added: for each line four rows of one column each. Rows go on beyond the box by what
-// a particle at its end reaches.
+// Sums of a plane while particles are added: for each line four rows, one for each column. Rows extend beyond the box
+// by the reach of a particle at its end.
 template <typename Real>
 class Plane {
    public:
@@ -35,7 +35,7 @@ class Plane {
 
     Real* row(std::int64_t line, int column) { return rows_.data() + (4 * line + column) * width_; }
 
-    // (line, point, column); what went beyond the box is where it began.
+    // (line, point, column); sums beyond the box are wrapped to its beginning.
     void write(Real* sums) {
         std::fill_n(sums, 4 * cells_ * cells_, Real(0));
         for (std::int64_t line = 0; line < cells_; ++line)

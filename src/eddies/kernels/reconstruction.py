@@ -31,7 +31,7 @@ class _Reconstruction(ctypes.Structure):
 
 class _Fit(ctypes.Structure):
     _fields_ = (members(INT, "receivers periodic_z") + members(NUMBER, "length volume ridge")
-                + members(ADDRESS, "offsets senders receiver position value kernel found"))
+                + members(ADDRESS, "offsets senders receiver position value kernel result"))
 
 
 def kernel_numbers(support: float, pieces: np.ndarray, signed: bool = False) -> tuple[float, ...]:
@@ -50,7 +50,7 @@ def sums_on_grid(library: ctypes.CDLL, grid: GridPlanes, numbers: tuple[float, .
                  columns: np.ndarray) -> np.ndarray:
     """sum_j c_j W(x - x_j) of columns c (n, 4) of particles (n, 3) at the points of the planes, (points, 4).
 
-    `numbers` are W as `kernel_numbers` returns it. The result has the precision of the columns.
+    The result has the precision of the columns.
     """
     position, columns = np.ascontiguousarray(position, np.float64), np.ascontiguousarray(columns)
     if columns.shape != (len(position), 4):
@@ -67,20 +67,15 @@ def fitted(library: ctypes.CDLL, box: Box, degree: int, numbers: tuple[float, ..
            values: np.ndarray) -> np.ndarray:
     """Moving least squares: values and their derivatives along x, y and z, (n, 4, 3), of the best polynomials.
 
-    Defined by `eddies.particles.particle_field.ParticleField.fitted`.
-
-    Parameters
-    ----------
-    degree : of the polynomials, 1 or 2. numbers : the weight W as `kernel_numbers` returns it.
-    volume : mean volume of a particle. ridge : see the definition.
-    offsets, senders : int64 (n + 1,) and (m,), the particles listed near each receiver; some may be too far.
-    receivers (n, 3), positions and values (s, 3), in double precision.
+    `eddies.particles.particle_field.ParticleField.fitted` defines them. `numbers` are the weight W as `kernel_numbers`
+    returns it, `volume` the mean volume of a particle. `offsets` (n + 1,) and `senders` (m,) are the particles listed
+    near each receiver; some may be too far. `positions` and `values` are (s, 3), `receivers` (n, 3).
     """
     kernel = np.array(numbers)
     offsets, senders = (np.ascontiguousarray(rows, np.int64) for rows in (offsets, senders))
     receivers, positions, values = (np.ascontiguousarray(a, np.float64) for a in (receivers, positions, values))
-    found = np.empty((len(receivers), 4, 3))
+    result = np.empty((len(receivers), 4, 3))
     given = _Fit(len(receivers), box.periodic_z, box.length, volume, ridge,
-                 *map(address, (offsets, senders, receivers, positions, values, kernel, found)))
+                 *map(address, (offsets, senders, receivers, positions, values, kernel, result)))
     getattr(library, FITS[degree])(ctypes.byref(given))
-    return found
+    return result

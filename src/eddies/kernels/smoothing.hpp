@@ -14,8 +14,8 @@ class Smoothing {
     using V = Vector<Real>;
 
    public:
-    // h, the least W there is, number of pieces, coefficients of each; then these, of u = 1 ... 0 from begin to end of
-    // a piece.
+    // h, the least value of W, the number of pieces, the number of coefficients; then the coefficients of each piece,
+    // in powers of u, which falls from 1 to 0 along the piece.
     explicit Smoothing(const double* given)
         : pieces_(static_cast<int>(given[2])), width_(static_cast<int>(given[3])), stride_(padded<Real>(width_)),
           least_(static_cast<Real>(given[1])), per_length_(static_cast<Real>(given[2] / given[0])),
@@ -24,7 +24,7 @@ class Smoothing {
             std::copy_n(given + 4 + piece * width_, width_, coefficients_.data() + piece * stride_);
     }
 
-    // W of some distances below h; of others anything that is finite.
+    // W at distances below h; any finite value at others.
     V value(V distance) const {
         V slope;
         return evaluated<false>(distance, slope);
@@ -61,7 +61,7 @@ class Smoothing {
             }
         }
         if (sloping) slope = -rate * per_length_;
-        return sum > least_ ? sum : V{} + least_;  // below zero, where that is the least, by rounding alone
+        return sum > least_ ? sum : V{} + least_;  // values below the least are rounding errors
     }
 };
 

@@ -1,10 +1,10 @@
-// Tensor-product B-splines between points and the planes of a periodic grid; tests/kernels/reference_splines.py is a reference.
+// Tensor-product B-splines between points and the planes of a periodic grid.
 //
-// Points are put in order of place once, into bins. What the splines around the points of a bin reach is copied to a
-// tile that fits a core's first cache, in which the components of a grid point are neighbours, and spread points are
-// added there first. The splines are made anew in each call from what fraction of a cell the points are at: that costs
-// less than to store and load them. Nothing depends on the number of threads: a value is the sum of one thread, and
-// what points add to a plane they add in one order.
+// Points are sorted into bins once. The grid points around a bin are copied to a tile that fits the first-level cache
+// of a core; the components of a grid point are neighbours there. Spread values are added to the tile first. The
+// weights of the splines are computed in each call from the points' fractions of a cell, which costs less than storing
+// them. Results do not depend on the number of threads: one thread sums a value, and points add to a plane in a fixed
+// order.
 
 #include <cmath>
 #include <cstdint>
@@ -29,14 +29,14 @@ struct Cloud {
 
 namespace {
 
-constexpr int LINES = 16, PLANES = 8, COLUMNS = 8;  // the most of a bin
+constexpr int LINES = 16, PLANES = 8, COLUMNS = 8;  // largest size of a bin
 constexpr int TOGETHER = 4;        // components in a tile
-constexpr int PADDING = 8;         // numbers behind the fractions along an axis that may be read
-constexpr int FEW = 2000;          // points that are not worth a second thread
-constexpr double FARTHEST = 1e15;  // in cells; beyond, numbers do not tell one from the next
+constexpr int PADDING = 8;         // numbers after the fractions along an axis that may be read
+constexpr int FEW = 2000;          // points below which one thread is used
+constexpr double FARTHEST = 1e15;  // in cells; beyond, floating-point numbers do not resolve a cell
 
-// Bins are chunks of lines, cut into layers of planes, cut into strips of columns, all about equally large. Chunks are
-// one or an even number of them, so long that what lies around the points of every other one has no line in common.
+// Bins are chunks of lines, cut into layers of planes, cut into strips of columns, all about equally large. There is
+// one chunk or an even number, and chunks are so long that the splines of every other one have no line in common.
 struct Bins {
     std::int64_t chunks, layers, strips;
 
@@ -57,7 +57,7 @@ inline Vector loaded(const Real* place) {
     return vector;
 }
 
-// The components at a grid point, and those of as many neighbours as fit a vector of 32 bytes.
+// The components at one grid point and at the next ones, as many as fit a vector of 32 bytes.
 template <typename Real>
 struct Vectors;
 
@@ -98,7 +98,7 @@ inline void store(Real* place, const Vector& vector) {
 #define PICKED(a, b, ...) __builtin_shuffle(a, b, typename Vectors<Real>::Places{__VA_ARGS__})
 #endif
 
-// Four vectors of four numbers -> those of their first numbers, of their second ones, ...
+// Transpose of four vectors of four numbers.
 template <typename Real>
 inline void transpose(typename Vectors<Real>::Point* rows) {
     using Point = typename Vectors<Real>::Point;
@@ -115,7 +115,7 @@ inline Real sum(const typename Vectors<Real>::Point& point) {
     return (point[0] + point[2]) + (point[1] + point[3]);
 }
 
-// Points whose splines are made together, and one number for each of them.
+// Points whose splines are computed together.
 template <typename Real>
 constexpr int BLOCK = 32 / sizeof(Real);
 template <typename Real>
@@ -136,7 +136,7 @@ struct Weights {
             Wide carried = {};
 #pragma GCC unroll 5
             for (int i = 0; i < order; ++i) {
-                // The distance of the point from the left end of each of the overlapping splines.
+                // Distance of the point from the left end of each of the overlapping splines.
                 const Wide left = fraction + Real(order - 1 - i), weight = values[i] * share;
                 values[i] = carried + weight * (Real(order) - left);
                 carried = weight * left;
@@ -159,14 +159,14 @@ struct Weights {
         for (int i = 0; i <= degree; ++i) store(places[i], values[i]);
     }
 
-    // Weights across lines, those of the planes times those of the lines in them.
+    // Weights across lines: those of the planes times those of the lines.
     static void multiply(const Weights& z, const Weights& y, Numbers<Real> (*across)[degree + 1]) {
         for (int k = 0; k <= degree; ++k)
             for (int j = 0; j <= degree; ++j) store(across[k][j], z.values[k] * y.values[j]);
     }
 };
 
-// The points from `begin` on, with the weights of the splines around them.
+// Points from `begin` on and the weights of the splines around them.
 template <int degree, typename Real>
 struct Block {
     static constexpr int width = degree + 1;
@@ -185,7 +185,7 @@ struct Block {
     }
 };
 
-// What the splines around the points of a bin reach: grid points with the components of up to four fields each.
+// The grid points around a bin, each with the components of up to four fields.
 template <int degree, typename Real>
 struct Tile {
     using Point = typename Vectors<Real>::Point;
@@ -194,7 +194,7 @@ struct Tile {
     const Cloud& cloud;
     std::int64_t begin, end, lowest[3];
     int size[3];
-    bool cut;  // by the end of the box
+    bool cut;  // whether the box ends within the tile
     std::int64_t starts[LINES + degree];  // of lines in a plane
     alignas(64) Real numbers[(PLANES + degree) * plane];
 
@@ -208,7 +208,7 @@ struct Tile {
                 highest[axis] = first > highest[axis] ? first : highest[axis];
             }
         for (int axis = 0; axis < 3; ++axis) size[axis] = static_cast<int>(highest[axis] - lowest[axis]) + degree + 1;
-        // Columns are moved by fours, also some more of them, where there are.
+        // Columns are moved in groups of four, if necessary with some that are not needed.
         const std::int64_t most = cloud.cells - (size[0] + TOGETHER - 1) / TOGETHER * TOGETHER;
         cut = most < 0 || lowest[0] + size[0] > cloud.cells;
         if (!cut) {
@@ -218,7 +218,7 @@ struct Tile {
         for (int j = 0; j < size[1]; ++j) starts[j] = (lowest[1] + j) % cloud.cells * cloud.cells;
     }
 
-    // Where the splines around a point begin.
+    // Address of the first grid point of a point's splines.
     Real* around(std::int64_t point) {
         const std::int32_t* first = cloud.first + 3 * point;
         return numbers + (first[2] - lowest[2]) * plane + (first[1] - lowest[1]) * row +
@@ -326,10 +326,10 @@ void interpolate(const Cloud& cloud, std::int64_t components, const Real* const*
                     Wide sum = {};
                     for (int i = 0; i < wides; ++i) sum += V::factors(&block.along_x[i * V::neighbours][p]) * sums[i];
                     const auto point = V::sum(sum);
-                    double* found = values + cloud.order[begin + p] * components + c;
+                    double* value = values + cloud.order[begin + p] * components + c;
 #pragma GCC unroll 4
                     for (int n = 0; n < TOGETHER; ++n)
-                        if (n < count) found[n] = point[n];
+                        if (n < count) value[n] = point[n];
                 }
             }
         });
@@ -426,24 +426,24 @@ void spread(const Cloud& cloud, std::int64_t components, Real* const* planes, co
     }
 }
 
-// The part that each of `size` places lies in, when they are cut into some of about equal size.
+// Part of each of `size` places that are cut into about equal parts.
 std::vector<std::int32_t> parts_of(std::int64_t size, std::int64_t parts) {
-    std::vector<std::int32_t> found(size);
+    std::vector<std::int32_t> part_of(size);
     for (std::int64_t part = 0; part < parts; ++part)
         for (std::int64_t i = part * size / parts; i < (part + 1) * size / parts; ++i)
-            found[i] = static_cast<std::int32_t>(part);
-    return found;
+            part_of[i] = static_cast<std::int32_t>(part);
+    return part_of;
 }
 
 }  // namespace
 
 extern "C" {
 
-// Of points on a grid of so many cells and planes.
+// Number of bins of a grid with these cells and planes.
 int splines_bins(int cells, int planes) { return static_cast<int>(Bins(cells, planes).all()); }
 
-// Makes the arrays of a cloud, of points (n, 3) on a grid of this spacing whose plane `lowest` is the first in memory.
-// Returns -1, or the number of the first point that has no place there, and then the arrays are not made.
+// Fill the arrays of a cloud for points (n, 3) on a grid of this spacing whose plane `lowest` is the first in memory.
+// Returns -1, or the number of the first point without a place there; the arrays are then incomplete.
 std::int64_t splines_arrange(const Cloud* arranged, const double* positions, double spacing, std::int64_t lowest) {
     const Cloud& cloud = *arranged;
     const std::int64_t cells = cloud.cells, before = (cloud.degree - 1) / 2;
@@ -459,7 +459,7 @@ std::int64_t splines_arrange(const Cloud* arranged, const double* positions, dou
         bool placed = true;
         for (int axis = 0; axis < 3; ++axis) {
             const double cell = std::floor(positions[3 * p + axis] / spacing);
-            placed = placed && std::abs(cell) < FARTHEST;  // what is not a number is not
+            placed = placed && std::abs(cell) < FARTHEST;  // false for NaN
             const std::int64_t index =
                 placed ? (static_cast<std::int64_t>(cell) - before - (axis == 2 ? lowest : 0)) % cells : 0;
             place[axis] = static_cast<std::int32_t>(index < 0 ? index + cells : index);

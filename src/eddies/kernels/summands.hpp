@@ -1,5 +1,5 @@
-// What is summed over pairs of particles: the terms of eddies/particles/terms, which are the definitions. Each is declared
-// once, by name, where it is defined: a formula, of which the gradient is derived (adjoint.hpp), or a class of its own.
+// Summands over pairs of particles. The terms in eddies/particles/terms define them. Each is registered by name where
+// it is implemented: as a formula, whose gradient adjoint.hpp derives, or as a class of its own.
 
 #pragma once
 
@@ -15,12 +15,12 @@
 
 extern "C" {
 
-// A summand, its sums and gradients. Those that are not asked for are null; kernels/pairs.py has the same structure.
+// A summand, its sums and gradients; null where not requested. kernels/pairs.py has the same structure.
 struct Given {
     const char* kind;
     std::int64_t numbers_count, parameters_count, components, scalar;  // the first scalar that it reads
     const double *numbers, *parameters;
-    const double* parity;      // (components): what the second particle of a mutual pair gets is that times the first's
+    const double* parity;      // (components): factor of the value for the second particle of a mutual pair
     void* sums;                // (components, count)
     const void* by_sums;       // (components, count)
     double* by_parameters;     // (parameters)
@@ -32,16 +32,16 @@ namespace eddies {
 
 constexpr int MOST_SCALARS = 4;  // columns of numbers that particles carry
 
-// Pairs: the separation in filter widths and the velocity difference in units of the velocity, first less second
-// particle; length of the separation, weight (1 - q^2)^2, and numbers of first and second.
+// Pairs: separation in filter widths and velocity difference in units of the velocity, first minus second particle;
+// length of the separation, weight (1 - q^2)^2, and scalars of the first and the second particle.
 template <typename Real>
 struct Block {
     alignas(64) Real x[3][BLOCK], v[3][BLOCK], distance[BLOCK], weight[BLOCK];
     const Real* scalar[2][MOST_SCALARS];
 };
 
-// The gradient by these, zero at first; those by separation, velocity difference and numbers stand in rows as records
-// of first and second particles have them.
+// Gradients by these, initially zero. Those by separation, velocity difference and scalars are rows in the order of the
+// records of first and second particles.
 template <typename Real>
 struct ByPairs {
     int width;
@@ -86,14 +86,14 @@ class Summand {
     virtual ~Summand() = default;
 
     // Components of pairs.
-    virtual void values(const Block<Real>& pairs, Components<Real> found) = 0;
+    virtual void values(const Block<Real>& pairs, Components<Real> result) = 0;
 
-    // From the gradient by components: to be added to that by what the pairs carry, unless that is null, and to that by
-    // parameters, a vector for each.
+    // From the gradient by components: add to the gradient by the quantities of the pairs, unless it is null, and to
+    // the gradient by parameters, a vector for each.
     virtual void gradients(const Block<Real>&, GivenComponents<Real>, ByPairs<Real>*, Real*) {}
 };
 
-// Kinds of summands by name. Of this library alone: other instruction sets may be loaded beside it.
+// Kinds of summands by name, local to this library: libraries for other instruction sets may be loaded too.
 struct Kind {
     std::unique_ptr<Summand<float>> (*single)(const Given&);
     std::unique_ptr<Summand<double>> (*full)(const Given&);
@@ -114,7 +114,7 @@ bool declare(const char* name) {
     return kinds().insert({name, {make<Class<float>, float>, make<Class<double>, double>}}).second;
 }
 
-// What a formula sees of a vector of pairs: each a `Vector`, a `Place` or a `Constant`.
+// Arguments of a formula for a vector of pairs: each a `Vector`, a `Place` or a `Constant`.
 template <typename Real, template <typename> class Column, template <typename> class Parameter, int scalars,
           int parameters>
 struct Pairs {
@@ -148,8 +148,8 @@ struct Pairs {
     }
 };
 
-// The summand of a formula. It is made of what is given; called with `Pairs` and a function that takes the number of a
-// component and what it is.
+// The summand of a formula. The formula is constructed from `Given`. It is called with `Pairs` and a function that
+// takes the number of a component and its value.
 template <typename Real, template <typename> class Formula>
 class FormulaSummand : public Summand<Real> {
     using V = Vector<Real>;
@@ -164,12 +164,12 @@ class FormulaSummand : public Summand<Real> {
         std::copy_n(given.parameters, std::min<std::int64_t>(factors, given.parameters_count), parameters_);
     }
 
-    void values(const Block<Real>& pairs, Components<Real> found) override {
+    void values(const Block<Real>& pairs, Components<Real> result) override {
         Pairs<Real, Vector, Vector, columns, factors> some;
         for (int k = 0; k < factors; ++k) some.parameter[k] = V{} + parameters_[k];
         for (int p = 0; p < BLOCK; p += lanes) {
             some.read(pairs, scalar_, p);
-            formula_(some, [&](int c, const V& value) { vector_at(found[c] + p) = value; });
+            formula_(some, [&](int c, const V& value) { vector_at(result[c] + p) = value; });
         }
     }
 
@@ -209,16 +209,16 @@ bool declare_formula(const char* name) {
     return kinds().insert({name, {make_formula<float, Formula>, make_formula<double, Formula>}}).second;
 }
 
-// One lane after the other, for the compiler to take several together.
+// A loop over lanes, which the compiler vectorises.
 #define EDDIES_PAIRS _Pragma("omp simd") for (int p = 0; p < BLOCK; ++p)
 
-// Of two vectors of a pair.
+// Scalar product of two vectors of a pair.
 template <typename Real>
 inline Real dot(const Real (*a)[BLOCK], const Real (*b)[BLOCK], int p) {
     return a[0][p] * b[0][p] + a[1][p] * b[1][p] + a[2][p] * b[2][p];
 }
 
-// Added to lengths by which vectors are divided (particles/terms/pair_basis.py).
+// Added to lengths by which vectors are divided (particles/terms/pair_network.py).
 constexpr double SMALL = 1e-6;
 
 // w NN_1 x and w NN_2 v, or with one output w NN, of a network of the pairs' invariants; with unit vectors x/|x| and
@@ -226,7 +226,7 @@ constexpr double SMALL = 1e-6;
 template <typename Real>
 class PairNetwork : public Summand<Real> {
    public:
-    // Numbers: outputs, whether densities enter as sum and square of the difference, whether the network is told
+    // Numbers: outputs, whether densities enter as sum and square of the difference, whether the network reads
     // density (the scalar), distance, speed, approach; whether directions are unit vectors, pairs weighted, the output
     // times the sign; widths of hidden layers.
     explicit PairNetwork(const Given& given)
@@ -240,18 +240,18 @@ class PairNetwork : public Summand<Real> {
         std::fill_n(by_v_, BLOCK, Real(1));
     }
 
-    void values(const Block<Real>& pairs, Components<Real> found) override {
+    void values(const Block<Real>& pairs, Components<Real> result) override {
         evaluate(pairs);
         const Rows<Real>& outputs = network_.outputs();
         const Real* along_x = outputs[0];
         if (this->components == 1) {
-            EDDIES_PAIRS found[0][p] = window_[p] * by_x_[p] * along_x[p];
+            EDDIES_PAIRS result[0][p] = window_[p] * by_x_[p] * along_x[p];
             return;
         }
         const Real* along_v = outputs[1];
         for (int c = 0; c < 3; ++c) {
-            EDDIES_PAIRS found[c][p] = window_[p] * by_x_[p] * along_x[p] * pairs.x[c][p];
-            EDDIES_PAIRS found[3 + c][p] = window_[p] * by_v_[p] * along_v[p] * pairs.v[c][p];
+            EDDIES_PAIRS result[c][p] = window_[p] * by_x_[p] * along_x[p] * pairs.x[c][p];
+            EDDIES_PAIRS result[3 + c][p] = window_[p] * by_v_[p] * along_v[p] * pairs.v[c][p];
         }
     }
 
@@ -275,19 +275,20 @@ class PairNetwork : public Summand<Real> {
     int scalar_;
     bool density_, distance_, speed_, approach_, unit_, weighted_, sign_;
     Network<Real> network_;
-    // |v|; the factors of x and v: 1, or 1/|x| and 1/|v|, the sign being one of x; w, where it is not that of the pairs.
+    // |v|; the factors of x and v: 1, or 1/|x| and 1/|v|, the sign being one of x; w, where it is not that of the
+    // pairs.
     alignas(64) Real speed_of_[BLOCK], by_x_[BLOCK], by_v_[BLOCK], open_[BLOCK];
     const Real* window_;  // w
 
     static std::vector<int> widths(const Given& given) {
-        const double* told = given.numbers;
-        std::vector<int> found(1, static_cast<int>(2 * told[2] + told[3] + told[4] + told[5]));
-        found.insert(found.end(), told + 9, told + given.numbers_count);
-        found.push_back(static_cast<int>(told[0]));
-        return found;
+        const double* numbers = given.numbers;
+        std::vector<int> widths(1, static_cast<int>(2 * numbers[2] + numbers[3] + numbers[4] + numbers[5]));
+        widths.insert(widths.end(), numbers + 9, numbers + given.numbers_count);
+        widths.push_back(static_cast<int>(numbers[0]));
+        return widths;
     }
 
-    // Taken into both of its callers it is slower by up to a twentieth.
+    // Inlining in both callers is slower by up to a twentieth.
     __attribute__((noinline)) void evaluate(const Block<Real>& pairs) {
         Rows<Real>& features = network_.features();
         int row = 0;
@@ -367,7 +368,7 @@ class PairNetwork : public Summand<Real> {
         }
     }
 
-    // The gradient of w NN_1 b_1 and w NN_2 b_2 by w and the directions, the networks being held.
+    // Gradient of w NN_1 b_1 and w NN_2 b_2 by w and the directions at fixed NN_1 and NN_2.
     void add_by_directions(const Block<Real>& pairs, GivenComponents<Real> given, const Real* along_x,
                            const Real* along_v, ByPairs<Real>& by) {
         for (int c = 0; c < 3; ++c) EDDIES_PAIRS {
@@ -411,7 +412,7 @@ struct Moments {
 
 static const bool moments = declare_formula<Moments>("moments");
 
-// w, or 1 of pairs within the radius.
+// w, or 1 for pairs within the radius.
 template <typename W>
 inline auto window(const W& w, bool weighted) {
     using Real = std::decay_t<decltype(value_of(w)[0])>;
@@ -437,9 +438,9 @@ inline auto tanh_if(bool bounded, const A& a) {
         return value;
 }
 
-// w Pi x/(unit |x| + length) with Pi = mu (|a_2| mu - |a_1|), mu = x.v / (|x|^2 + softening); or of approaching pairs
-// alone; or with tanh(x.v). Numbers: 0, 1 or 2 of these forms, the softening, whether pairs are weighted, unit and
-// length. Parameters: |a_1| and |a_2|.
+// w Pi x/(unit |x| + length) with Pi = mu (|a_2| mu - |a_1|), mu = x.v / (|x|^2 + softening); for all pairs; for
+// approaching ones; or with tanh(x.v). Numbers: 0, 1 or 2 of these forms, the softening, whether pairs are weighted,
+// unit and length. Parameters: |a_1| and |a_2|.
 template <typename Real>
 struct EddyViscosity {
     static constexpr int components = 3, scalars = 0, parameters = 2;
@@ -498,7 +499,7 @@ inline auto spline_fall(const Q& q) {
            where(inner, Real(2) - Real(3) * q, (Real(1) - q) * (Real(1) - q) / where(inner, Real(1), q));
 }
 
-// What weakly compressible smoothed particle hydrodynamics sums, (P_i/rho_i^2 + P_j/rho_j^2 + Pi) (-W'/r) x, in filter
+// Force of weakly compressible smoothed particle hydrodynamics, (P_i/rho_i^2 + P_j/rho_j^2 + Pi) (-W'/r) x, in filter
 // widths and units of the velocity. Numbers: the distance at which W ends, the unit of the result, and the softening.
 // Parameters: alpha c and beta of Pi. Scalars: P/rho^2 and rho.
 template <typename Real>
@@ -523,9 +524,8 @@ struct Wcsph {
 
 static const bool wcsph = declare_formula<Wcsph>("wcsph");
 
-// What makes the rate of density of smoothed particle hydrodynamics: v.x W'/r, and, with two components, (rho_j - rho_i)
-// W'/r, both over rho_i rho_j. Numbers: the distance at which W ends, in filter widths, and the units of both. The
-// scalar: rho.
+// Density rate of smoothed particle hydrodynamics: v.x W'/r and, with two components, (rho_j - rho_i) W'/r, both over
+// rho_i rho_j. Numbers: the distance at which W ends, in filter widths, and the units of both. The scalar: rho.
 template <typename Real>
 struct Continuity {
     static constexpr int scalars = 1, parameters = 0;
@@ -576,7 +576,7 @@ struct TransportVelocity {
 
 static const bool transport_velocity = declare_formula<TransportVelocity>("transport-velocity");
 
-// W of the distance, in units of length.
+// W at the distance, in units of length.
 template <typename Real>
 class KernelSum : public Summand<Real> {
    public:
@@ -584,9 +584,9 @@ class KernelSum : public Summand<Real> {
         this->differentiable = false;
     }
 
-    void values(const Block<Real>& pairs, Components<Real> found) override {
+    void values(const Block<Real>& pairs, Components<Real> result) override {
         for (int p = 0; p < BLOCK; p += VectorOf<Real>::lanes)
-            vector_at(found[0] + p) = kernel_.value(vector_at(pairs.distance + p));
+            vector_at(result[0] + p) = kernel_.value(vector_at(pairs.distance + p));
     }
 
    private:
@@ -595,7 +595,7 @@ class KernelSum : public Summand<Real> {
 
 static const bool kernel_sum = declare<KernelSum>("kernel-sum");
 
-// What makes the average of a vector a and its gradient, relative to the first particle's own: V W, V W a', V grad W
+// Sums for the average of a vector a and its gradient, relative to the first particle's own a: V W, V W a', V grad W
 // and V a'_c grad_d W with a' = a_j - a_i. Scalars: V, and the components of a.
 template <typename Real>
 class KernelAverage : public Summand<Real> {
@@ -606,23 +606,23 @@ class KernelAverage : public Summand<Real> {
         this->differentiable = false;
     }
 
-    void values(const Block<Real>& pairs, Components<Real> found) override {
+    void values(const Block<Real>& pairs, Components<Real> result) override {
         const Real* volume = pairs.scalar[1][scalar_];
         alignas(64) Real slope[BLOCK];
         for (int p = 0; p < BLOCK; p += VectorOf<Real>::lanes) {
             const Vector<Real> r = vector_at(pairs.distance + p);
             Vector<Real> rate;
-            vector_at(found[0] + p) = vector_at(volume + p) * kernel_.value(r, rate);
+            vector_at(result[0] + p) = vector_at(volume + p) * kernel_.value(r, rate);
             vector_at(slope + p) = r > 0 ? vector_at(volume + p) * rate / r : Vector<Real>{};
         }
         for (int d = 0; d < 3; ++d)
-            EDDIES_PAIRS found[4 + d][p] = slope[p] * pairs.x[d][p];
+            EDDIES_PAIRS result[4 + d][p] = slope[p] * pairs.x[d][p];
         for (int c = 0; c < 3; ++c) {
             const Real *own = pairs.scalar[0][scalar_ + 1 + c], *other = pairs.scalar[1][scalar_ + 1 + c];
             EDDIES_PAIRS {
                 const Real apart = other[p] - own[p];
-                found[1 + c][p] = found[0][p] * apart;
-                for (int d = 0; d < 3; ++d) found[7 + 3 * c + d][p] = found[4 + d][p] * apart;
+                result[1 + c][p] = result[0][p] * apart;
+                for (int d = 0; d < 3; ++d) result[7 + 3 * c + d][p] = result[4 + d][p] * apart;
             }
         }
     }

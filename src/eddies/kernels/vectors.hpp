@@ -1,5 +1,5 @@
-// Numbers that are worked on together: a register of the processor, blocks of points, and records of numbers that
-// belong to one point against rows of one number for each point of a block.
+// Data layouts: vectors of the processor, blocks of points, and the exchange between records (all numbers of a point)
+// and rows (one number of all points of a block).
 
 #pragma once
 
@@ -33,7 +33,7 @@ struct VectorOf {
 template <typename Real>
 using Vector = typename VectorOf<Real>::type;
 
-// Whole numbers of as many bits.
+// Integers of the same size.
 template <typename Real>
 struct BitsOf;
 
@@ -60,20 +60,20 @@ struct VectorAnywhere {
     typedef Real type __attribute__((vector_size(VECTOR_BYTES), may_alias, aligned(sizeof(Real))));
 };
 
-// A vector of what stands anywhere, of numbers or other things of as many bits.
+// Load a vector from any address; the elements may be of another type of the same size.
 template <typename Thing>
 inline auto unaligned(const Thing* place) {
     using Real = std::conditional_t<sizeof(Thing) == 4, float, double>;
     return (Vector<Real>)*reinterpret_cast<const typename VectorAnywhere<Real>::type*>(place);
 }
 
-// Adds to a vector that stands anywhere.
+// Add to a vector at any address.
 template <typename Real>
 inline void add_unaligned(Real* place, Vector<Real> more) {
     *reinterpret_cast<typename VectorAnywhere<Real>::type*>(place) += more;
 }
 
-// The vector that stands where one may begin.
+// The vector at an aligned address.
 template <typename Real>
 inline Vector<Real>& vector_at(Real* place) {
     return *reinterpret_cast<Vector<Real>*>(place);
@@ -84,7 +84,7 @@ inline const Vector<Real>& vector_at(const Real* place) {
     return *reinterpret_cast<const Vector<Real>*>(place);
 }
 
-// Numbers of at most that size: the nearest ones of others. What is not a number stays so.
+// Numbers of at most that size: the nearest ones of others. NaN stays NaN.
 template <typename Real>
 inline Vector<Real> clipped(Vector<Real> x, Real largest) {
     const Vector<Real> above = Vector<Real>{} + largest, below = -above;
@@ -106,7 +106,7 @@ inline Vector<Real> clipped(Vector<Real> x, Real largest) {
 #endif
 }
 
-// Bits of lanes, all of whose bits are set or none, the first lane's first.
+// One bit for each lane of a mask, the first lane in the lowest bit.
 template <typename Lanes>
 inline std::uint64_t bits(Lanes lanes) {
     [[maybe_unused]] constexpr bool single = sizeof(lanes[0]) == 4;
@@ -117,13 +117,13 @@ inline std::uint64_t bits(Lanes lanes) {
     if constexpr (single) return _mm256_movemask_ps((__m256)lanes);
     return _mm256_movemask_pd((__m256d)lanes);
 #else
-    std::uint64_t found = 0;
-    for (int lane = 0; lane < int(sizeof(lanes) / sizeof(lanes[0])); ++lane) found |= (lanes[lane] & 1ull) << lane;
-    return found;
+    std::uint64_t mask = 0;
+    for (int lane = 0; lane < int(sizeof(lanes) / sizeof(lanes[0])); ++lane) mask |= (lanes[lane] & 1ull) << lane;
+    return mask;
 #endif
 }
 
-// Numbers of consecutive things from `begin` on whose bit is set, written one after the other, and up to a vector more.
+// Write the numbers `begin`, `begin` + 1, ... whose bit is set, one after the other; up to a vector more is written.
 inline void write_numbers(std::int32_t begin, std::uint64_t bits, std::int32_t* places) {
 #ifdef __AVX512F__
     const __m512i lane = _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
@@ -137,7 +137,7 @@ inline void write_numbers(std::int32_t begin, std::uint64_t bits, std::int32_t* 
 #endif
 }
 
-// Numbers that begin where a vector may, zero at first.
+// Aligned numbers, initially zero.
 template <typename Real>
 class Aligned {
    public:
@@ -164,11 +164,11 @@ class Rows {
     Aligned<Real> numbers_;
 };
 
-// Numbers of a record that are moved together.
+// Group: the numbers of a record that are moved together.
 template <typename Real>
 constexpr int GROUP = 32 / sizeof(Real);
 
-// Numbers of a record, so that it is a whole number of groups.
+// Size of a record, rounded up to whole groups.
 template <typename Real>
 constexpr int padded(int numbers) {
     return (numbers + GROUP<Real> - 1) / GROUP<Real> * GROUP<Real>;
@@ -213,8 +213,8 @@ inline void transpose(Vector<Real>* rows) {
     }
 }
 
-// Rows (width, BLOCK) of the records (.., width) of numbered points; the width is a whole number of groups. Taken into
-// its callers it makes gradients over pairs a sixth slower without AVX.
+// Gather the records (.., width) of numbered points as rows (width, BLOCK); the width is a whole number of groups.
+// Inlining makes gradients over pairs a sixth slower without AVX.
 template <typename Real>
 __attribute__((noinline)) void gather(const Real* records, int width, const std::int32_t* number, Real* rows) {
     using V = Vector<Real>;
@@ -233,7 +233,7 @@ __attribute__((noinline)) void gather(const Real* records, int width, const std:
         }
 }
 
-// Adds rows, of the first `count` points of a block, to their records.
+// Add rows of the first `count` points of a block to their records.
 template <typename Real>
 inline void scatter_add(const Real* rows, int width, const std::int32_t* number, int count, Real* records) {
     using V = Vector<Real>;

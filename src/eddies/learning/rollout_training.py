@@ -113,7 +113,7 @@ class RolloutTrainer:
             nonlocal near
             moved = replace(particles, position=position, velocity=velocity)
             energies = self.resolution.band_energies(moved, near=near)
-            near = self.resolution.found
+            near = self.resolution.latest
             return energies
 
         energies = _recomputed(energies_of, particles.position, particles.velocity)

@@ -24,14 +24,12 @@ class HaloExchange:
 
     Each rank sends the particles near its lower face down and those near its upper face up. The two faces stay
     separate even if both neighbours are the same rank: a particle then may have two images, which differ in z by a
-    period. Ghost rows from above come first, then those from below. One rank sends nothing. Raises HaloError if a slab
-    is thinner than `width`.
+    period. Ghost rows from above come first, then those from below. One rank has no ghosts; its methods are not called.
+    Raises HaloError if a slab is thinner than `width`.
     """
 
     def __init__(self, decomposition: SlabDecomposition, positions: np.ndarray, width: float) -> None:
-        self.decomposition = decomposition
-        self.owned = len(positions)
-        self.count = 0
+        self.decomposition, self.owned, self.count = decomposition, len(positions), 0
         if decomposition.size == 1:
             return
         require_thick_slabs(decomposition, width)
@@ -47,8 +45,6 @@ class HaloExchange:
         """Return the ghost rows (count, ...) of a column of owned rows (n, ...)."""
         owned = np.asarray(owned)
         slab, tail = self.decomposition, owned.shape[1:]
-        if slab.size == 1:
-            return np.empty((0, *tail), owned.dtype)
         return np.concatenate([
             _exchange(slab, owned[self._down], slab.below, slab.above, (self._from_above, *tail)),
             _exchange(slab, owned[self._up], slab.above, slab.below, (self._from_below, *tail))])
@@ -57,9 +53,9 @@ class HaloExchange:
         """Return ghost positions (count, 3), shifted by a period in z across the periodic face."""
         ghosts = self.forward(positions)
         slab = self.decomposition
-        if slab.size > 1 and slab.rank == slab.size - 1:
+        if slab.rank == slab.size - 1:
             ghosts[: self._from_above, 2] += slab.length
-        if slab.size > 1 and slab.rank == 0:
+        if slab.rank == 0:
             ghosts[self._from_above :, 2] -= slab.length
         return ghosts
 
@@ -68,12 +64,10 @@ class HaloExchange:
         ghosts = np.asarray(ghosts)
         slab, tail = self.decomposition, ghosts.shape[1:]
         owned = np.zeros((self.owned, *tail), ghosts.dtype)
-        if slab.size > 1:
-            # Each owned row occurs once per face, so plain indexed addition is exact.
-            owned[self._down] += _exchange(slab, ghosts[: self._from_above], slab.above, slab.below,
-                                           (len(self._down), *tail))
-            owned[self._up] += _exchange(slab, ghosts[self._from_above :], slab.below, slab.above,
-                                         (len(self._up), *tail))
+        # Each owned row occurs once per face, so plain indexed addition is exact.
+        owned[self._down] += _exchange(slab, ghosts[: self._from_above], slab.above, slab.below,
+                                       (len(self._down), *tail))
+        owned[self._up] += _exchange(slab, ghosts[self._from_above :], slab.below, slab.above, (len(self._up), *tail))
         return owned
 
 

@@ -85,13 +85,11 @@ class StopRequest:
 
     @property
     def reason(self) -> str:
-        """The reason of the stop, in a few words."""
         if self._answer > _SIGNALS:
             return signal.Signals(self._answer - _SIGNALS).name
         return {_FILE: "the file STOP", _TIME: "its limit of wall time"}[self._answer]
 
     def checkpoint_done(self) -> None:
-        """Start the interval to the next checkpoint."""
         self._checkpoint_at = time.monotonic() + self._interval
 
     def _raise_loss(self) -> None:

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -33,14 +32,27 @@ REGULARISATION = 1e-3
 UNDECLARED = 'no term of this model reads "{}": add it to the `reads` of the settings'
 
 
-class PairSum(Protocol):
-    """A sum over pairs: a pair term (see PairTerm), or the moments that several terms share."""
+class PairSum:
+    """A sum of `pair_values` over the neighbours within the radius of interaction.
 
-    width: int
-    mutual: bool
-    parity: Tensor
+    Attributes
+    ----------
+    width : largest number of values held for a pair at once; it determines how many pairs are taken together.
+    mutual : whether j gets from i what i gets from j times `parity`. Each pair is then evaluated once.
+    parity : (components,), 1 or -1.
+    """
 
-    def pair_values(self, pairs: ScaledPairs) -> Tensor: ...
+    width = 8
+    mutual = False
+    parity: Tensor = torch.ones(1)
+
+    def pair_values(self, pairs: ScaledPairs) -> Tensor:
+        """Values to sum over neighbours, (components, m). They must vanish beyond the radius of interaction."""
+        raise NotImplementedError(f"{type(self).__name__} has no pair_values(pairs)")
+
+    def compiled(self, context: Context) -> CompiledSum | None:
+        """The same sum for the compiled library, or None. Each class must define it itself; it is not inherited."""
+        return None
 
 
 @dataclass(frozen=True)
@@ -79,7 +91,6 @@ class Context:
 
     @property
     def local(self) -> LocalParticles:
-        """The particles that this rank sees, ghosts included."""
         if self._local is None:
             raise TermError(UNDECLARED.format("pairs"))
         return self._local
@@ -137,7 +148,7 @@ class Context:
     # ---- sums over pairs
 
     def pair_sums(self, term: PairSum) -> Tensor:
-        """Sums (components, k) of a term's pair values over each particle's neighbours; collective."""
+        """Sums (components, k) of a term over the neighbours of each particle; collective."""
         if term not in self._sums:
             self.sum_pairs([term])
         return self._sums[term]
@@ -177,17 +188,18 @@ class Context:
         local, flow, owned = self.local, self.flow, len(self.particles)
         wanted = np.zeros(len(local.position), bool)
         wanted[slice(owned) if self.rows is None else self.rows.numpy()] = True
-        space = PairSpace(local.box.length, local.box.periodic_z, flow.cutoff, flow.scales.filter_width,
-                          flow.scales.velocity, mutual)
+        box = local.neighborhood.box
+        space = PairSpace(box.length, box.periodic_z, flow.cutoff, flow.scales.filter_width, flow.scales.velocity,
+                          mutual)
         velocity = self.column("velocity") if any(each.reads_velocity for each in summands.values()) else None
         sums = compiled_sums(space, list(summands.values()), [summand.parity for summand in summands], local.position,
                              velocity, wanted, self.dtype)
         return [each[:, :owned] if self.rows is None else each.index_select(1, self.rows) for each in sums]
 
     def _torch_sums(self, summands: Sequence[PairSum]) -> Sequence[Tensor]:
+        together = self.rows is not None or torch.is_grad_enabled()
         blocks = []
-        for block in self._blocks(summands):
-            pairs = self._pairs(block)
+        for pairs in [self._pairs(self.rows)] if together else self.pairs_in_blocks(max(s.width for s in summands)):
             values = [summand.pair_values(pairs) for summand in summands]
             blocks.append(pairs.pairs.sum(torch.cat(values).T).T)
         return torch.cat(blocks, dim=1).split([len(value) for value in values])
@@ -197,28 +209,20 @@ class Context:
         pairs = self.local.neighbors.pairs(position[: len(self.particles)], position, block, self.dtype)
         return ScaledPairs(pairs, self.column, self.flow)
 
-    def _blocks(self, summands: Sequence[PairSum]) -> Iterator[Tensor | slice | None]:
-        """Receivers to take together: as many as fit the cache, or all if a gradient is recorded."""
-        if self.rows is not None or torch.is_grad_enabled():
-            yield self.rows
-            return
-        yield from self.blocks(max(summand.width for summand in summands))
+    def pairs_in_blocks(self, width: int) -> Iterator[ScaledPairs]:
+        """All pairs, in both orders, of consecutive particles. A block, with `width` numbers a pair, fits the cache.
 
-    def blocks(self, width: int) -> Iterator[slice]:
-        """Consecutive particles whose pairs, with `width` numbers each, fit the cache; at least one block."""
+        There is at least one block.
+        """
         together = max(PAIR_VALUES_TOGETHER[self.particles.position.device.type] // width, 1)
-        yield from self.local.neighbors.blocks(together)
-
-    def scaled_pairs(self, width: int) -> Iterator[ScaledPairs]:
-        """All pairs, in both orders, in such blocks."""
-        for block in self.blocks(width):
+        for block in self.local.neighbors.blocks(together):
             yield self._pairs(block)
 
 
-class _SharedMoments:
+class _SharedMoments(PairSum):
     """The sums of `Moments`: w, then the entries of w x x^T."""
 
-    width, mutual, parity = 8, True, torch.ones(7)
+    mutual, parity = True, torch.ones(7)
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
         return torch.stack([pairs.weight, *moments.products(pairs.weight * pairs.x, pairs.x)])

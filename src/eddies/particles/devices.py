@@ -9,20 +9,16 @@ from eddies.errors import UserError
 from eddies.parallel.communicator import Comm, node_rank
 
 
-class DeviceError(UserError, RuntimeError):
-    """The requested device does not exist."""
-
-
 def prepare_torch(device: str, comm: Comm) -> torch.device:
     """Return the device of this rank, and set the number of threads to OMP_NUM_THREADS (default 1 a rank).
 
-    Ranks share the GPUs of a node in turn. Raises DeviceError if a GPU is requested and there is none.
+    Ranks share the GPUs of a node in turn. Raises UserError if a GPU is requested and there is none.
     """
     torch.set_num_threads(threads())
     if device == "cpu":
         return torch.device("cpu")
     if not torch.cuda.is_available():
-        raise DeviceError('device = "cuda": torch finds no GPU here; set device = "cpu"')
+        raise UserError('device = "cuda": torch finds no GPU here; set device = "cpu"')
     return torch.device("cuda", node_rank(comm) % torch.cuda.device_count())
 
 

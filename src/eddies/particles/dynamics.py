@@ -78,7 +78,7 @@ class ParticleDynamics:
             self.resolution.forget()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """State that later evaluations depend on, besides the particles: the time and the closure's predictions."""
+        """The time and the predictions of the closure, on which later evaluations depend."""
         resolved = {} if self.resolution is None else self.resolution.state_dict()
         return {"time": torch.tensor(self.time, dtype=torch.float64), **resolved}
 
@@ -104,7 +104,9 @@ class ParticleDynamics:
             return replace(particles, position=self.box.wrap(particles.position)), companions
         columns = particles.columns()
         recorded = torch.is_grad_enabled() and any(column.requires_grad for column in columns.values())
-        if recorded or not self._away(particles):
+        away = (self.neighborhood.outdated(particles) if self.neighborhood is not None
+                else farthest_outside(self.decomposition, particles) > 0)
+        if recorded or not away:
             return particles, companions
         prefix = "companion "
         named = {prefix + name: column for name, column in companions.items()}
@@ -112,12 +114,6 @@ class ParticleDynamics:
         moved = at_home(self.decomposition, {**columns, **named}, reach)
         return (ParticleSet(**{name: moved[name] for name in columns}),
                 {name: moved[prefix + name] for name in companions})
-
-    def _away(self, particles: ParticleSet) -> bool:
-        """Whether halo and list are outdated, or, without these, a particle is outside its slab."""
-        if self.neighborhood is not None:
-            return self.neighborhood.outdated(particles)
-        return farthest_outside(self.decomposition, particles) > 0
 
     def rates(self, particles: ParticleSet, rows: Tensor | None = None, kept: Mapping[str, LinearRates] | None = None,
               density: Tensor | None = None, time: float | None = None) -> Rates:
@@ -139,7 +135,6 @@ class ParticleDynamics:
 
     def context(self, particles: ParticleSet, rows: Tensor | None = None, density: Tensor | None = None,
                 time: float | None = None) -> Context:
-        """Context for the evaluation of terms at these particles; collective."""
         if self.neighborhood is not None:
             self.neighborhood.update(particles)
             if self._local is None or not self._local.fit(particles.position):

@@ -29,14 +29,14 @@ class _GhostExchange(torch.autograd.Function):
         return torch.from_numpy(ctx.halo.adjoint(as_numpy(gradient))).to(gradient.device), None, None
 
 
-def exchange_ghosts(halo: HaloExchange, owned: Tensor) -> Tensor:
-    """Ghost rows (halo.count, ...) of a column of owned particles (n, ...); collective, differentiable."""
-    return _GhostExchange.apply(owned, halo, False)
+def with_ghosts(halo: HaloExchange, owned: Tensor, positions: bool = False) -> Tensor:
+    """Column (n, ...) of the owned particles, followed by its ghost rows; collective, differentiable.
 
-
-def exchange_ghost_positions(halo: HaloExchange, positions: Tensor) -> Tensor:
-    """Ghost positions (halo.count, 3), shifted by one period in z beyond the periodic face; collective."""
-    return _GhostExchange.apply(positions, halo, True)
+    Ghost `positions` are shifted by one period in z beyond the periodic face. One rank has no ghosts.
+    """
+    if halo.decomposition.size == 1:
+        return owned
+    return torch.cat([owned, _GhostExchange.apply(owned, halo, positions)])
 
 
 class _GlobalSum(torch.autograd.Function):

@@ -23,7 +23,7 @@ def pair_features(dynamics: ParticleDynamics, particles: ParticleSet) -> Iterato
     """
     terms = dynamics.model.networks
     context = dynamics.context(particles, density=particles.density)
-    for pairs in context.scaled_pairs(max(term.width for term in terms)):
+    for pairs in context.pairs_in_blocks(max(term.width for term in terms)):
         yield torch.cat([term.features(pairs) for term in terms])
 
 

@@ -62,13 +62,10 @@ class ReferenceScales:
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
-            if value is None:
-                continue
-            if name in MAY_VANISH and not (math.isfinite(value) and value >= 0):
-                raise ScaleError(f"reference scale {name} = {value}: must be finite and not negative; start from "
-                                 "another flow ([initial])")
-            if name not in MAY_VANISH and not (math.isfinite(value) and value > 0):
-                raise ScaleError(f"reference scale {name} = {value}: must be finite and positive, as a model is made "
+            vanishes = name in MAY_VANISH and value == 0
+            if value is not None and not vanishes and not (math.isfinite(value) and value > 0):
+                sign = "not negative" if name in MAY_VANISH else "positive"
+                raise ScaleError(f"reference scale {name} = {value}: must be finite and {sign}, as a model is made "
                                  "dimensionless by it; start from a flow that moves and changes ([initial], [forcing])")
 
     def required(self, name: str) -> float:
@@ -79,7 +76,6 @@ class ReferenceScales:
         return value
 
     def to_dict(self) -> dict[str, float | None]:
-        """The scales by name, ready for JSON."""
         return {name: None if value is None else float(value) for name, value in asdict(self).items()}
 
 
@@ -116,16 +112,16 @@ class FlowUnits:
 
     @property
     def particle_mass(self) -> float:
-        """Mass of a particle: mass of the fluid over the number of particles."""
+        """Mass of the fluid over the number of particles."""
         return self.scales.density_mean * self.scales.spacing**3
 
 
 def measured_scales(comm: Comm, at: Columns, after: Columns, interval: float) -> dict[str, float]:
     """Root mean squares over all particles, of one component of vectors; collective.
 
-    velocity_rms and acceleration_rms, and with a density density_rms (of its fluctuation) and density_rate_rms. Values
-    are those of the frame `at`; rates are differences to the frame `after`, an `interval` later. Frames are this rank's
-    rows of `velocity` (n, 3) and, optionally, `density` (n,), of the same particles.
+    velocity_rms and density_rms (of the fluctuation) at the frame `at`; acceleration_rms and density_rate_rms from the
+    change to the frame `after`, an `interval` later. Frames are this rank's rows of `velocity` (n, 3) and, optionally,
+    `density` (n,), of the same particles.
     """
     scales = {}
     for name, rate in RATES.items():

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from eddies.particles.kriging import Covariance
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.smoothing_kernels import SmoothingKernel
 
@@ -18,39 +16,6 @@ log = logging.getLogger("eddies")
 DEGREES = {"linear": 1, "quadratic": 2}
 WORDS = {"average": "averages with the learned kernel", "kriging": "kriging among neighbours",
          **{name: f"polynomials of degree {degree} fitted to neighbours" for name, degree in DEGREES.items()}}
-
-
-class Reconstructed:
-    """Velocity reconstructed from particles at one moment. All methods are collective.
-
-    Parameters
-    ----------
-    field : the particles.
-    at : function that returns velocity (k, 3) and gradient (k, 3, 3) [component, direction] at points (k, 3) of this
-        rank.
-    """
-
-    def __init__(self, field: ParticleField, at: Callable[[Tensor], tuple[Tensor, Tensor]]) -> None:
-        self.field, self.at = field, at
-
-    def velocity_on_grid(self) -> Tensor:
-        """Velocity (m, 3) at this rank's grid points, z slowest."""
-        return self.at(self.field.points)[0]
-
-    def at_particles(self) -> tuple[Tensor, Tensor]:
-        """Velocity (n, 3) and gradient (n, 3, 3) at the owned particles."""
-        return self.at(self.field.owned)
-
-
-class _Averaged(Reconstructed):
-    """Kernel averages, which have a faster sum on the whole grid."""
-
-    def __init__(self, field: ParticleField, kernel: SmoothingKernel) -> None:
-        self.kernel, self.volume = kernel, field.volumes(kernel)
-        super().__init__(field, lambda points: field.averaged(kernel, self.volume, points))
-
-    def velocity_on_grid(self) -> Tensor:
-        return self.field.velocity_on_whole_grid(self.kernel, self.volume)
 
 
 @dataclass(frozen=True)
@@ -73,32 +38,50 @@ class Form:
 
     @property
     def words(self) -> str:
-        """The form in words, for reports."""
         return WORDS[self.name]
 
     @property
     def support(self) -> float:
-        """Radius h within which particles contribute."""
         return self.kernel.support
 
     def of(self, field: ParticleField) -> Reconstructed:
         """Reconstruct the velocity of the particles of a field; collective."""
-        if self.name == "average":
-            return _Averaged(field, self.kernel)
-        if self.name == "kriging":
-            return Reconstructed(field, lambda points: self._kriged(field, points))
-        return Reconstructed(field, lambda points: self._fitted(field, points, DEGREES[self.name]))
+        return Reconstructed(self, field)
 
-    def _fitted(self, field: ParticleField, points: Tensor, degree: int) -> tuple[Tensor, Tensor]:
-        return field.fitted(self.kernel, degree, self.mean_volume, points)
 
-    def _kriged(self, field: ParticleField, points: Tensor) -> tuple[Tensor, Tensor]:
+class Reconstructed:
+    """Velocity reconstructed from particles at one moment. All methods are collective."""
+
+    def __init__(self, form: Form, field: ParticleField) -> None:
+        self.form, self.field = form, field
+        self._volume = field.volumes(form.kernel) if form.name == "average" else None
+
+    def at(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Velocity (k, 3) and gradient (k, 3, 3) [component, direction] at points (k, 3) of this rank."""
+        if self._volume is not None:
+            return self.field.averaged(self.form.kernel, self._volume, points)
+        return self._kriged(points) if self.form.name == "kriging" else self._fitted(DEGREES[self.form.name], points)
+
+    def velocity_on_grid(self) -> Tensor:
+        """Velocity (m, 3) at this rank's grid points, z slowest."""
+        if self._volume is not None:
+            return self.field.velocity_on_whole_grid(self.form.kernel, self._volume)
+        return self.at(self.field.points)[0]
+
+    def at_particles(self) -> tuple[Tensor, Tensor]:
+        """Velocity (n, 3) and gradient (n, 3, 3) at the owned particles."""
+        return self.at(self.field.owned)
+
+    def _fitted(self, degree: int, points: Tensor) -> tuple[Tensor, Tensor]:
+        return self.field.fitted(self.form.kernel, degree, self.form.mean_volume, points)
+
+    def _kriged(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Kriging; a quadratic fit where there are too many neighbours or the equations are singular."""
-        velocity, gradient = field.kriged(Covariance.of_filtered_turbulence(self.filter_width), points)
+        velocity, gradient = self.field.kriged(self.form.filter_width, points)
         solved = velocity.isfinite().all(1) & gradient.isfinite().all(2).all(1)
         failed = torch.nonzero(~solved).squeeze(1)
         if len(failed):
             log.warning("kriging: %d of %d points have too many neighbours or singular equations; a quadratic fit "
                         "replaces kriging there", len(failed), len(points))
-            velocity[failed], gradient[failed] = self._fitted(field, points[failed], 2)
+            velocity[failed], gradient[failed] = self._fitted(2, points[failed])
         return velocity, gradient

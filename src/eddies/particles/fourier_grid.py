@@ -50,7 +50,6 @@ class FourierGrid(ModeOperators):
     # ---- linear steps
 
     def to_modes(self, fields: Tensor) -> Tensor:
-        """Modes of fields."""
         return _ToModes.apply(fields, self)
 
     def to_fields(self, modes: Tensor) -> Tensor:
@@ -58,7 +57,6 @@ class FourierGrid(ModeOperators):
         return _ToFields.apply(modes, self)
 
     def points(self, position: Tensor) -> Points:
-        """Positions (n, 3) on the grid."""
         return Points(self.spline, position)
 
     def at(self, modes: Tensor, points: Points) -> Tensor:
@@ -73,7 +71,6 @@ class FourierGrid(ModeOperators):
         return self.to_modes(_Spread.apply(values, points.position, points)) * self.prefilter
 
     def zeros(self, *leading: int) -> Tensor:
-        """Zero modes (*leading, kz, ky, kx)."""
         return torch.zeros(*leading, *self.spectral.spectral_shape, dtype=self.dtype.to_complex())
 
     # ---- formulas on modes

@@ -39,7 +39,7 @@ class Integrator:
         return particles, Rates(**self.memory)
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
-        """Return the particles one time step later; collective."""
+        """The particles one time step later; collective."""
         raise NotImplementedError
 
 
@@ -164,5 +164,4 @@ def _advanced(particles: ParticleSet, stage: ParticleSet, rates: Rates, time_ste
 
 
 def _pace(particles: ParticleSet, rates: Rates) -> Tensor:
-    """dx/dt (n, 3)."""
     return particles.velocity if rates.shift_velocity is None else particles.velocity + rates.shift_velocity

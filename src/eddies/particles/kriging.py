@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -29,49 +28,41 @@ NARROWEST, SCALES = 1.2, 6
 LEAST_WEIGHT = 0.01
 
 
-@dataclass(frozen=True)
-class Covariance:
-    """C(r) = sum_m amplitudes[m] exp(-slowest 2^m r^2), C(0) = 1, from the widest to the narrowest part."""
+def covariance(filter_width: float) -> tuple[float, np.ndarray]:
+    """Rate b and amplitudes a (m,) of C(r) = sum_m a_m exp(-b 2^m r^2), C(0) = 1.
 
-    slowest: float
-    amplitudes: tuple[float, ...]
-
-    @classmethod
-    def of_filtered_turbulence(cls, width: float) -> Covariance:
-        """Covariance of a velocity with E(k) ~ k^(-5/3) after a Gaussian filter of width d, for any variance.
-
-        A spectrum k^(-5/3) is a sum of Gaussians of lengths l with weights l^(2/3). None is narrower than d/sqrt(6),
-        since E G^2 ~ exp(-k^2 d^2/12).
-        """
-        squares = [width**2 / 6 * NARROWEST * 2.0**m for m in reversed(range(SCALES))]
-        weights = [square ** (1 / 3) for square in squares]
-        return cls(1 / (2 * squares[0]), tuple(weight / sum(weights) for weight in weights))
+    It is the covariance of a velocity with E(k) ~ k^(-5/3) after a Gaussian filter of width d. A spectrum k^(-5/3) is a
+    sum of Gaussians of lengths l with weights l^(2/3). None is narrower than d/sqrt(6), since E G^2 ~ exp(-k^2 d^2/12).
+    """
+    squares = [filter_width**2 / 6 * NARROWEST * 2.0**m for m in reversed(range(SCALES))]
+    weights = [square ** (1 / 3) for square in squares]
+    return 1 / (2 * squares[0]), np.array([weight / sum(weights) for weight in weights])
 
 
-def interpolated(pairs: Pairs, support: float, covariance: Covariance, sender_values: Tensor) -> tuple[Tensor, Tensor]:
+def interpolated(pairs: Pairs, support: float, filter_width: float, values: Tensor) -> tuple[Tensor, Tensor]:
     """Kriging at points that are no particles: field (n, c) and gradient (n, c, 3) from values (s, c) of the particles.
 
     The result is sum_j w_j f_j with weights as in `kriging_weights` and b_j = C(|x - x_j|), or its derivatives by x.
     The weights of the field add up to one and those of the gradient to zero, so a constant is exact. The result is NaN
     where the equations cannot be solved, and zero where no particle lies within the support.
     """
-    _, weights = kriging_weights(pairs, support, covariance, sited=False)
-    values = sender_values.to(pairs.displacement.dtype).contiguous()
+    _, weights = kriging_weights(pairs, support, filter_width, sited=False)
     sums = torch.from_numpy(compiled.weighted_sums(library(), pairs.offsets.numpy(), pairs.sender.numpy(), None,
-                                                   weights[UP_TO_FIRST], values.numpy()))
+                                                   weights[UP_TO_FIRST],
+                                                   values.to(pairs.displacement.dtype).contiguous().numpy()))
     return sums[..., OWN], sums[..., FIRST]
 
 
-def kriging_weights(pairs: Pairs, support: float, covariance: Covariance,
+def kriging_weights(pairs: Pairs, support: float, filter_width: float,
                     sited: bool = True) -> tuple[np.ndarray, list[np.ndarray]]:
     """Kriging weights: the best linear estimate sum_j w_j f_j of a field and its derivatives, w = K^-1 b.
 
-    K_jk = C(|x_j - x_k|), plus the noise NOISE / max(1 - (r/support)^4, 1e-4) of each particle on the diagonal. r is
-    its distance, so that neighbours at the support enter and leave without a jump. If the receiver is a particle
-    (`sited`), its own value f_i is among the f_j. In the row of the field b is then 1 for the particle and 0 for its
-    neighbours. The result is w_i times the difference of f_i and the neighbours' estimate. In the rows of derivatives
-    b is the derivative of C(|x - x_j|) by x. The mean of f is unknown. A multiple of K^-1 1 is subtracted so that the
-    weights add up to zero (ordinary kriging).
+    K_jk = C(|x_j - x_k|), `covariance`, plus the noise NOISE / max(1 - (r/support)^4, 1e-4) of each particle on the
+    diagonal. r is its distance, so that neighbours at the support enter and leave without a jump. If the receiver is a
+    particle (`sited`), its own value f_i is among the f_j. In the row of the field b is then 1 for the particle and 0
+    for its neighbours. The result is w_i times the difference of f_i and the neighbours' estimate. In the rows of
+    derivatives b is the derivative of C(|x - x_j|) by x. The mean of f is unknown. A multiple of K^-1 1 is subtracted
+    so that the weights add up to zero (ordinary kriging).
 
     Returns
     -------
@@ -81,7 +72,7 @@ def kriging_weights(pairs: Pairs, support: float, covariance: Covariance,
     """
     displacement = np.ascontiguousarray(pairs.displacement.detach().cpu().T.numpy())
     return compiled.kriging_weights(library(), pairs.offsets.cpu().numpy(), displacement, support, NOISE,
-                                    covariance.slowest, np.array(covariance.amplitudes), sited)
+                                    *covariance(filter_width), sited)
 
 
 class Kriging:
@@ -98,7 +89,7 @@ class Kriging:
 
     def __init__(self, pairs: Pairs, seen: int, support: float, filter_width: float,
                  with_ghosts: Callable[[Tensor], Tensor]) -> None:
-        own, others = kriging_weights(pairs, support, Covariance.of_filtered_turbulence(filter_width))
+        own, others = kriging_weights(pairs, support, filter_width)
         self._own, self._others = torch.from_numpy(own), [torch.from_numpy(row) for row in others]
         self._offsets, self._senders = pairs.offsets.cpu(), pairs.sender.cpu()
         self._seen, self._filter_width, self._with_ghosts = seen, filter_width, with_ghosts
@@ -118,7 +109,6 @@ class Kriging:
         return self._estimate(self._own[FIRST], self._others[FIRST], field[:, None])[:, 0]
 
     def laplacian(self, field: Tensor) -> Tensor:
-        """Laplacian (n,) of a field (n,)."""
         own, others = self._laplacian
         return self._estimate(own[None], [others], field[:, None])[:, 0, 0]
 

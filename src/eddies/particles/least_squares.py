@@ -57,11 +57,14 @@ class LeastSquares:
         """P B^T of values (n, 3) at points; collective, differentiable."""
         return self.projected(self.grid.spread(values, points) * self.grid.spectral.cells**3)
 
-    def descent(self, values: Tensor, points: Points, modes: Tensor) -> Tensor:
-        """P B^T values - penalty modes; collective, differentiable."""
+    def descent(self, missing: Tensor, points: Points, modes: Tensor) -> Tensor:
+        """Half the steepest descent at modes u, P B^T (v - B u) - penalty u, from `missing` = v - B u (n, 3).
+
+        It vanishes at the minimum. Collective, differentiable.
+        """
         if torch.is_grad_enabled():
-            return self.gathered(values, points) - self.penalty * modes
-        spread = self.grid.to_modes(points.spread(values))
+            return self.gathered(missing, points) - self.penalty * modes
+        spread = self.grid.to_modes(points.spread(missing))
         return torch.from_numpy(self._passes.image(spread.numpy(), -modes.numpy())[0])
 
     def projected(self, modes: Tensor) -> Tensor:

@@ -69,17 +69,14 @@ class LagrangianModel(nn.Module):
 
     @property
     def reads(self) -> set[str]:
-        """All inputs of the terms."""
         return {name for term in self.terms.values() for name in term.settings.reads}
 
     @property
     def gives(self) -> set[str]:
-        """All contributions of the terms."""
         return {name for term in self.terms.values() for name in term.settings.gives}
 
     @property
     def reads_density(self) -> bool:
-        """Whether the particles need a density."""
         return "density" in self.reads
 
     @property
@@ -93,18 +90,16 @@ class LagrangianModel(nn.Module):
         return "density_rate" in self.gives
 
     @property
-    def regresses_density(self) -> bool:
-        """Whether a density rate is learned from the rates at single moments."""
-        return self.learns_density and not any(term.settings.learns_through_horizons for term in self._giving_rate)
-
-    @property
     def learns_density(self) -> bool:
         """Whether a density rate has learned parameters."""
-        return any(True for term in self._giving_rate for _ in term.parameters())
+        return any("density_rate" in term.settings.gives and list(term.parameters()) for term in self.terms.values())
 
     @property
-    def _giving_rate(self) -> list[Term]:
-        return [term for term in self.terms.values() if "density_rate" in term.settings.gives]
+    def regresses_density(self) -> bool:
+        """Whether a density rate is learned from the rates at single moments."""
+        through_horizons = any("density_rate" in term.settings.gives and term.settings.learns_through_horizons
+                               for term in self.terms.values())
+        return self.learns_density and not through_horizons
 
     @property
     def networks(self) -> list[PairTerm]:
@@ -120,9 +115,9 @@ class LagrangianModel(nn.Module):
     def rates(self, context: Context, kept: Mapping[str, LinearRates] | None = None) -> Rates:
         """Sum of the terms; differentiable, collective.
 
-        The result has `acceleration` (k, 3) with the `force_modes` in it, and `density_rate` (k,) and the shift if a
-        term gives them. A `density` that terms give is the whole density (n,), not its deviation. `kept` replaces terms
-        at these particles; see `linear_rates`.
+        It has `acceleration` (k, 3), `force_modes` included, and `density_rate` (k,) and a shift if a term gives them.
+        A `density` that terms give is the whole density (n,), not its deviation. `kept` replaces terms; see
+        `linear_rates`.
         """
         kept, sums = kept or {}, []
         for stage in self._stages if self.density_is_given and context.density is None else [list(self.terms.items())]:
@@ -143,8 +138,7 @@ class LagrangianModel(nn.Module):
     def linear_rates(self, context: Context) -> dict[str, LinearRates]:
         """Effect of each parameter at given particles, by name of the linear terms; collective.
 
-        Terms that read a density given by others are left out. Training stores the result for particles that it
-        evaluates repeatedly.
+        Terms that read a density given by others are left out. Training stores the result for a frame.
         """
         terms = self._stages[0] if self.density_is_given else self.terms.items()
         return {name: self._linear_rates(term, context) for name, term in terms if term.linear}
@@ -255,7 +249,6 @@ def _everywhere(term: Term) -> bool:
 
 
 def _evaluated(term: Term, context: Context) -> Rates:
-    """Rates of a term at the requested particles."""
     rates = _checked(term(context.everywhere if _everywhere(term) else context), term)
     return rates if isinstance(term, PairTerm) else rates.at(context.rows)
 
@@ -271,13 +264,7 @@ def _checked(result: object, term: Term) -> Rates:
 
 
 def build_model(settings: Mapping[str, TermSettings], paths: Iterable[str], flow: FlowUnits) -> LagrangianModel:
-    """Build a model with initial parameters, in double precision.
-
-    Parameters
-    ----------
-    settings : of each term, by its name.
-    paths : the word or import path of each term.
-    flow : the flow that the model is made for.
+    """Model with initial parameters in double precision. `paths` are the words or import paths of its terms.
 
     Raises TermError if an import path does not lead to a Term or the term cannot be made, and ImportPathError if it
     leads to nothing.

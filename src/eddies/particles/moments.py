@@ -10,7 +10,7 @@ ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def weight(distance: Tensor, cutoff: float) -> Tensor:
-    """w = (1 - q^2)^2 of q = distance/cutoff; zero with zero slope for q >= 1."""
+    """w = (1 - q^2)^2 of q = distance/cutoff, 0 for q >= 1."""
     q = distance / cutoff
     return torch.clamp(1 - q * q, min=0) ** 2
 

@@ -88,7 +88,7 @@ class NeighborList:
         receiver, segment, sender = (index.index_select(0, near) for index in (receiver, segment, sender))
         components = self._difference(receivers, senders, receiver, sender)
         displacement = torch.stack([component.to(dtype) for component in components])
-        return Pairs(receiver, segment, sender, displacement.T, safe_norm(displacement, dim=0), len(numbers))
+        return Pairs(receiver, segment, sender, displacement.T, safe_norm(displacement), len(numbers))
 
     def _compiled_pairs(self, receivers: Tensor, senders: Tensor, numbers: Tensor, dtype: torch.dtype) -> Pairs:
         kind = np.dtype(str(dtype).removeprefix("torch."))
@@ -98,7 +98,7 @@ class NeighborList:
         return Pairs(receiver, segment, sender, displacement.T, distance, len(numbers))
 
     def _difference(self, receivers: Tensor, senders: Tensor, receiver: Tensor, sender: Tensor) -> list[Tensor]:
-        """Components of x_i - x_j between nearest images. One component at a time is faster than (m, 3) rows."""
+        """Components of x_i - x_j between nearest images. One at a time is faster than (m, 3) rows."""
         return [self.box.nearest_image(x.index_select(0, receiver) - y.index_select(0, sender), axis)
                 for axis, (x, y) in enumerate(zip(receivers.unbind(1), senders.unbind(1)))]
 

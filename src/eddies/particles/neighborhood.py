@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -15,7 +14,7 @@ from eddies.parallel.halo import HaloError, HaloExchange, require_thick_slabs
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import any_rank, global_max
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.exchanges import exchange_ghost_positions, exchange_ghosts
+from eddies.particles.exchanges import with_ghosts
 from eddies.particles.faults import find_unplaced
 from eddies.particles.kriging import Kriging
 from eddies.particles.neighbor_list import NeighborList
@@ -36,7 +35,7 @@ class LocalParticles:
 
     def fit(self, owned: Tensor) -> bool:
         """Whether they belong to this unchanged tensor of owned positions, the present halo and list, and the present
-        recording of gradients. The answer is the same on all ranks."""
+        recording of gradients; the same on all ranks."""
         return self._owned is owned and self._state == self._state_of(owned)
 
     def _state_of(self, owned: Tensor) -> tuple[int, int, bool]:
@@ -49,20 +48,14 @@ class LocalParticles:
         On several ranks z is not periodic here, and ghosts have the z at which the slab sees them.
         """
         # Stored component by component, which is faster for the gathering of pairs.
-        return self.neighborhood.with_ghosts(self._owned, exchange_ghost_positions).T.contiguous().T
-
-    @property
-    def box(self) -> PeriodicBox:
-        """The box in which differences of these positions are taken."""
-        return self.neighborhood.box
+        return with_ghosts(self.neighborhood.halo, self._owned, positions=True).T.contiguous().T
 
     @property
     def neighbors(self) -> NeighborList:
-        """The neighbour list of these rows."""
         return self.neighborhood.neighbors
 
     def kriging(self, filter_width: float, dtype: torch.dtype) -> Kriging:
-        """Kriging among neighbours at all owned particles, for fields that have passed a filter of this width."""
+        """Kriging among neighbours at all owned particles, for fields that have passed a filter."""
         if self._kriging is None:
             position = self.position.detach()
             pairs = self.neighbors.pairs(position[: len(self._owned)], position, dtype=dtype)
@@ -99,14 +92,11 @@ class Neighborhood:
 
     def outdated(self, particles: ParticleSet) -> bool:
         """Whether, on any rank, the particles are others or one has moved by more than half the skin or to NaN."""
-        return any_rank(self.decomposition.comm, not self._moved(particles) <= self.skin / 2)
-
-    def _moved(self, particles: ParticleSet) -> float:
-        """Largest distance that a particle of this rank has moved since the build; infinite for other particles."""
-        if particles.id is not self._ids:
-            return math.inf
-        moved = self.box.displacement(particles.position.detach(), self._built_at)
-        return math.sqrt(float((moved * moved).sum(-1).max())) if len(moved) else 0.0
+        distance = math.inf
+        if particles.id is self._ids:
+            moved = self.box.displacement(particles.position.detach(), self._built_at)
+            distance = math.sqrt(float((moved * moved).sum(-1).max())) if len(moved) else 0.0
+        return any_rank(self.decomposition.comm, not distance <= self.skin / 2)
 
     def update(self, particles: ParticleSet) -> None:
         """Rebuild halo and list if they are outdated. No particle changes rank.
@@ -125,7 +115,7 @@ class Neighborhood:
         self._ids, self._built_at = particles.id, particles.position.detach().clone()
         self.builds += 1
         with torch.no_grad():
-            self._unlisted = self.with_ghosts(particles.position, exchange_ghost_positions)
+            self._unlisted = with_ghosts(self.halo, particles.position, positions=True)
 
     @property
     def neighbors(self) -> NeighborList:
@@ -136,16 +126,11 @@ class Neighborhood:
         return self._neighbors
 
     def local(self, position: Tensor) -> LocalParticles:
-        """The particles that this rank sees, with present positions (n, 3) of the owned ones."""
         return LocalParticles(position, self)
 
     def column(self, owned: Tensor) -> Tensor:
         """Column (n, ...) of the owned particles, followed by its ghost rows."""
-        return self.with_ghosts(owned, exchange_ghosts)
-
-    def with_ghosts(self, owned: Tensor, exchange: Callable[[HaloExchange, Tensor], Tensor]) -> Tensor:
-        """Column (n, ...) of the owned particles, followed by the ghost rows of an exchange."""
-        return owned if self.decomposition.size == 1 else torch.cat([owned, exchange(self.halo, owned)])
+        return with_ghosts(self.halo, owned)
 
 
 def farthest_outside(slab: SlabDecomposition, particles: ParticleSet) -> float:

@@ -48,11 +48,9 @@ class Pairs:
         return torch.searchsorted(self.segment, torch.arange(self.count + 1, device=self.segment.device))
 
     def at_receivers(self, column: Tensor) -> Tensor:
-        """A particle column (n, ...) at the receiver of each pair: (m, ...)."""
         return gather_rows(column, self.receiver)
 
     def at_senders(self, column: Tensor) -> Tensor:
-        """A particle column (n, ...) at the sender of each pair: (m, ...)."""
         return gather_rows(column, self.sender)
 
     def sum(self, values: Tensor) -> Tensor:
@@ -95,13 +93,12 @@ class _SegmentSum(torch.autograd.Function):
 class ScaledPairs:
     """Pairs (i, j) and their quantities in the units of a model, each computed at first use.
 
-    Lengths are in units of the filter width d, velocities of v_rms, density fluctuations of rho_rms:
-    x = (x_i - x_j)/d, v = (v_i - v_j)/v_rms, rho' = (rho - rho_0)/rho_rms.
+    x = (x_i - x_j)/d (3, m), v = (v_i - v_j)/v_rms (3, m) and rho' = (rho - rho_0)/rho_rms, with the filter width d.
 
     Parameters
     ----------
     pairs : in the units of the simulation.
-    column : returns a column (s, ...), "velocity" or "density", of the particles that the pairs number.
+    column : returns the column "velocity" or "density" (s, ...) of the particles that the pairs number.
     flow : the units, and the radius of interaction.
     """
 
@@ -110,12 +107,10 @@ class ScaledPairs:
 
     @cached_property
     def x(self) -> Tensor:
-        """(3, m)."""
         return self.pairs.displacement.T / self.flow.scales.filter_width
 
     @cached_property
     def v(self) -> Tensor:
-        """(3, m)."""
         return self.velocity_difference / self.flow.scales.velocity
 
     @cached_property
@@ -160,7 +155,7 @@ class ScaledPairs:
         if "distance" in names:
             features.append(self.distance)
         if "speed" in names:
-            features.append(safe_norm(self.v, dim=0))
+            features.append(safe_norm(self.v))
         if "approach" in names:
             features.append(self.approach)
         return torch.stack(features)
@@ -168,15 +163,13 @@ class ScaledPairs:
 
 @dataclass(frozen=True)
 class CompiledSum:
-    """A term's sum over pairs, as the compiled library takes it.
+    """A term's sum over pairs in the form of the compiled library.
 
     Parameters
     ----------
-    kind : its name in the library (kernels/summands.hpp).
-    numbers : its constants there.
+    kind, numbers : its name and its constants there (kernels/summands.hpp).
     parameters : (p,), differentiable; none by default.
     scalars : columns (s,) of all particles that this rank sees, differentiable.
-    reads_velocity : whether it depends on velocities.
     """
 
     kind: str
@@ -190,13 +183,8 @@ def compiled_sums(space: PairSpace, summands: Sequence[CompiledSum], parities: S
                   velocity: Tensor | None, wanted: np.ndarray, dtype: torch.dtype) -> tuple[Tensor, ...]:
     """Sums (components, s) of each summand over the neighbours of the particles `wanted`, bool (s,); differentiable.
 
-    The values of other particles are undefined. Raises ValueError if a position is not finite.
-
-    Parameters
-    ----------
-    parities : of each summand, (components,); see PairTerm.
-    position, velocity : (s, 3), of all particles that this rank sees; velocity may be None if no summand reads it.
-    dtype : type of the arithmetic.
+    Other particles have undefined values. `parities` are those of PairSum, `position` and `velocity` (s, 3) those of
+    all particles that this rank sees. Raises ValueError if a position is not finite.
     """
     columns: list[Tensor] = []
     placed = []

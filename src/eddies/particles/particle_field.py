@@ -13,8 +13,8 @@ from eddies.kernels.pairs import PairSpace
 from eddies.kernels.reconstruction import GridPlanes, fitted, sums_on_grid, kernel_numbers
 from eddies.parallel.halo import HaloExchange
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.exchanges import exchange_ghost_positions, exchange_ghosts
-from eddies.particles.kriging import Covariance, interpolated
+from eddies.particles.exchanges import with_ghosts
+from eddies.particles.kriging import interpolated
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.pairs import CompiledSum, Pairs, compiled_sums
 from eddies.particles.particle_set import as_numpy
@@ -49,8 +49,8 @@ class ParticleField:
         self.decomposition, self.dtype, self.owned, self.support = decomposition, dtype, position, support
         self._box = PeriodicBox(decomposition.length, periodic_z=decomposition.size == 1)
         self.halo = HaloExchange(decomposition, as_numpy(position), support)
-        self._position = torch.cat([position, exchange_ghost_positions(self.halo, position)])
-        self._velocity = self._with_ghosts(velocity).to(dtype)
+        self._position = with_ghosts(self.halo, position, positions=True)
+        self._velocity = with_ghosts(self.halo, velocity).to(dtype)
         self.points = grid_points(decomposition, decomposition.planes)
         self._entries: Tensor | None = None
 
@@ -61,7 +61,7 @@ class ParticleField:
         if kernel.mean_volume is not None:
             return self._velocity.new_full((len(self._position),), kernel.mean_volume)
         sums = self._sums(kernel, "kernel-sum", 1, self._position, len(self.owned))[0]
-        return self._with_ghosts(1 / (sums + kernel.value(sums.new_zeros(()))))
+        return with_ghosts(self.halo, 1 / (sums + kernel.value(sums.new_zeros(()))))
 
     def volumes_by_table(self, kernel: HermiteKernel) -> Tensor:
         """Volumes of all local particles (s,) for a tabulated kernel; collective, differentiable.
@@ -77,7 +77,7 @@ class ParticleField:
                 self._entries = torch.cat([_table_sums(kernel, neighbors.pairs(self.owned, self._position, block,
                                                                                self.dtype))
                                            for block in neighbors.blocks(PAIRS_TOGETHER)])
-        return self._with_ghosts(1 / (self._entries @ kernel.table))
+        return with_ghosts(self.halo, 1 / (self._entries @ kernel.table))
 
     def on_grid(self, kernel: SmoothingKernel, volume: Tensor, rows: Tensor | slice) -> tuple[Tensor, Tensor]:
         """Average velocity (k, 3) and its gradient (k, 3, 3) at some of this rank's grid points; differentiable."""
@@ -130,12 +130,12 @@ class ParticleField:
         return result[:, 0], result[:, 1:].transpose(1, 2)
 
     @torch.no_grad()
-    def kriged(self, covariance: Covariance, receivers: Tensor) -> tuple[Tensor, Tensor]:
+    def kriged(self, filter_width: float, receivers: Tensor) -> tuple[Tensor, Tensor]:
         """Velocity (k, 3) and gradient (k, 3, 3) by kriging with all neighbours within the support; see
         `interpolated`."""
         neighbors = self._neighbors_of(receivers)
-        blocks = [interpolated(neighbors.pairs(receivers, self._position, block, self.dtype), self.support, covariance,
-                               self._velocity) for block in neighbors.blocks(KRIGED_TOGETHER)]
+        blocks = [interpolated(neighbors.pairs(receivers, self._position, block, self.dtype), self.support,
+                               filter_width, self._velocity) for block in neighbors.blocks(KRIGED_TOGETHER)]
         return torch.cat([velocity for velocity, _ in blocks]), torch.cat([gradient for _, gradient in blocks])
 
     def _sums(self, kernel: SmoothingKernel, kind: str, components: int, position: Tensor, count: int,
@@ -148,9 +148,6 @@ class ParticleField:
         return sums[:, :count]
 
     # ---- neighbours
-
-    def _with_ghosts(self, own: Tensor) -> Tensor:
-        return torch.cat([own, exchange_ghosts(self.halo, own)])
 
     @cached_property
     def _around(self) -> NeighborList:

@@ -39,7 +39,6 @@ class ParticleSet:
         return len(self.id)
 
     def columns(self) -> dict[str, Tensor]:
-        """The existing columns, by name."""
         return {name: column for name, column in vars(self).items() if column is not None}
 
     def to_numpy(self) -> dict[str, np.ndarray]:

@@ -38,8 +38,8 @@ class PeriodicBox(Box):
         return wrapped if self.periodic_z else torch.cat([wrapped[..., :2], positions[..., 2:]], dim=-1)
 
 
-def safe_norm(vectors: Tensor, dim: int = -1) -> Tensor:
-    """Euclidean length along `dim`; its gradient at a zero vector is zero instead of undefined."""
-    square = (vectors * vectors).sum(dim)
+def safe_norm(vectors: Tensor) -> Tensor:
+    """Lengths (...) of vectors (3, ...); the gradient at a zero vector is zero instead of undefined."""
+    square = (vectors * vectors).sum(0)
     zero = square == 0
     return torch.where(zero, square, torch.sqrt(torch.where(zero, torch.ones_like(square), square)))

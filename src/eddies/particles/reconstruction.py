@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from eddies.particles.pairs import Pairs
-from eddies.particles.smoothing_kernels import SmoothingKernel
+from eddies.particles.smoothing_kernels import SmoothingKernel, over_distance
 
 
 def volumes(kernel: SmoothingKernel, pairs: Pairs) -> Tensor:
@@ -21,16 +21,11 @@ def volumes(kernel: SmoothingKernel, pairs: Pairs) -> Tensor:
 
 
 def reconstruct(kernel: SmoothingKernel, pairs: Pairs, sender_volumes: Tensor, sender_values: Tensor) -> Tensor:
-    """Average <A>(x) = sum_j V_j A_j W(x - x_j) / sum_j V_j W(x - x_j) at the receivers: (count, components).
+    """Average <A>(x) = sum_j V_j A_j W(x - x_j) / sum_j V_j W(x - x_j) at the receivers x: (count, components).
 
     A kernel with a mean volume gives the numerator alone, Eq. 6. The result is zero where no particle lies within the
-    support.
-
-    Parameters
-    ----------
-    kernel : its support must not exceed the cutoff of the pairs.
-    pairs : the receivers are the points x. A particle that is a receiver must be among its own neighbours.
-    sender_volumes, sender_values : (s,) and (s, components), V and A of all local particles.
+    support. The volumes V (s,) and values A (s, components) are those of all local particles. A particle that is a
+    receiver must be among its own neighbours.
     """
     return _average(kernel, pairs, pairs.at_senders(sender_volumes), pairs.at_senders(sender_values).T)[0]
 
@@ -43,9 +38,7 @@ def reconstruct_with_gradient(kernel: SmoothingKernel, pairs: Pairs, sender_volu
     """
     volume, value, distance = pairs.at_senders(sender_volumes), pairs.at_senders(sender_values).T, pairs.distance
     average, factor = _average(kernel, pairs, volume, value)
-    # At distance zero both slope and displacement vanish.
-    divisor = torch.where(distance > 0, distance, torch.ones_like(distance))
-    gradient = (volume * kernel.derivative(distance) / divisor) * pairs.displacement.T
+    gradient = volume * over_distance(kernel.derivative(distance), distance) * pairs.displacement.T
     deviation = value - average.T.contiguous().index_select(1, pairs.segment)
     products = deviation.unsqueeze(1) * gradient.unsqueeze(0)
     sums = pairs.sum(products.flatten(0, 1).T).reshape(pairs.count, *products.shape[:2])

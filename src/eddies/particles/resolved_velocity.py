@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,7 +29,7 @@ EXPONENT, DISSIPATION, DISSIPATION_ONSET, WEIGHT = 11 / 3, 5.2, 0.4, 100.0
 # Final residuals relative to the velocities, of a solve that starts from zero and of one that starts from a prediction.
 # The latter residual is spread over all modes, the former stays in poorly determined ones. At twice the latter value a
 # forced flow diverged (docs/closure.md).
-TOLERANCE, TOLERANCE_FORESEEN = 2e-4, 1e-3
+TOLERANCE, TOLERANCE_PREDICTED = 2e-4, 1e-3
 # Final residual of the solve in the backward pass, relative to the incoming gradient. Gradients of a loss through four
 # frames then have an error of 2e-3, with half of the iterations of 2e-4.
 TOLERANCE_ADJOINT = 3e-3
@@ -98,7 +99,6 @@ class ResolvedFlow:
 
     @property
     def filter_transfer(self) -> Tensor:
-        """Transfer function G of the filter for each mode (kz, ky, kx)."""
         return self.grid.filter_transfer(self.filter_width)
 
     @cached_property
@@ -143,7 +143,7 @@ class ResolvedVelocity:
 
     Conjugate gradients, preconditioned by 1 / (N + 5 sigma^2/P_k), end when the preconditioned residual is `tolerance`
     of the velocities, or after a given number of `iterations`. With the time of an evaluation they start from a
-    prediction (`foreseen`) and end at `tolerance_foreseen`; in the backward pass they end at `tolerance_adjoint`.
+    prediction (`predicted`) and end at `tolerance_predicted`; in the backward pass they end at `tolerance_adjoint`.
 
     Products of modes above a third of the number of cells are aliased. For fields known at particles that error is far
     below the error of the highest modes themselves.
@@ -159,13 +159,13 @@ class ResolvedVelocity:
     collective. Raises HaloError on all ranks if a particle is farther outside its slab than the ghost planes reach.
     """
 
-    tolerance, tolerance_foreseen, tolerance_adjoint = TOLERANCE, TOLERANCE_FORESEEN, TOLERANCE_ADJOINT
+    tolerance, tolerance_predicted, tolerance_adjoint = TOLERANCE, TOLERANCE_PREDICTED, TOLERANCE_ADJOINT
     most_iterations = MOST_ITERATIONS
     iterations: int | None = None
     #: iterations, residual and convergence of each solve so far
     solves: list[tuple[int, float, bool]]
     #: modes of the last solve; None before the first
-    found: Tensor | None = None
+    latest: Tensor | None = None
 
     def __init__(self, grid: FourierGrid, filter_width: float, kolmogorov_length: float = 0.0,
                  weight: float = WEIGHT) -> None:
@@ -196,7 +196,10 @@ class ResolvedVelocity:
 
         The solve starts from the prediction for `time`, from the modes `near` (3, kz, ky, kx), or from zero.
         """
-        self._require_reach(particles)
+        reach = self.grid.reach
+        if farthest_outside(self.grid.decomposition, particles) >= reach:
+            raise HaloError(f"a particle is farther than {reach:.3g} outside its slab before it can change rank, "
+                            "beyond the ghost planes: shorten the time step or the skin")
         comm = self.grid.decomposition.comm
         mean = mean_over_ranks(comm, particles.velocity)
         relative, points = particles.velocity - mean, self.grid.points(particles.position)
@@ -206,14 +209,14 @@ class ResolvedVelocity:
             speed = math.sqrt(square / (3 * count)) if count else 0.0
             start = None if near is None else self.equations.projected(near)
             if time is not None:
-                start = self.foreseen(time, as_numpy(mean), speed)
+                start = self.predicted(time, as_numpy(mean), speed)
             flow = self._solved(flow, start, count, square)
         self.solves.append((flow.iterations, flow.residual, flow.converged))
-        self.found = flow.velocity.detach()
+        self.latest = flow.velocity.detach()
         if torch.is_grad_enabled():
             flow = replace(flow, left_over=None)  # it has no gradient
-            gradient = self._descent(flow, flow.missing())
-            flow = replace(flow, velocity=_Solution.apply(gradient, flow.velocity, self._adjoint(flow)))
+            descent = self.equations.descent(flow.missing(), flow.points, flow.velocity)
+            flow = replace(flow, velocity=_Solution.apply(descent, flow.velocity, self._adjoint(flow)))
         return flow
 
     def band_energies(self, particles: ParticleSet, near: Tensor | None = None) -> Tensor:
@@ -238,7 +241,7 @@ class ResolvedVelocity:
         self._moments.append(_Moment(time, flow.velocity.detach(), rate))
         self.speed = float(flow.rms)
 
-    def foreseen(self, time: float, mean: np.ndarray, speed: float) -> Tensor | None:
+    def predicted(self, time: float, mean: np.ndarray, speed: float) -> Tensor | None:
         """Predict the modes at a time; None without earlier evaluations.
 
         The nearer of the last two evaluations at different times is extrapolated with the rates of both (Adams and
@@ -259,9 +262,9 @@ class ResolvedVelocity:
         return worth * self._carried(near.velocity + step * rate, step, mean)
 
     def forget(self) -> None:
-        """Start the next solve from zero."""
+        """Discard predictions: the next solve starts from zero."""
         self._moments: list[_Moment] = []
-        self.solves, self.found = [], None
+        self.solves, self.latest = [], None
         #: rms u' of a component of the resolved velocity last remembered; 0 before
         self.speed = 0.0
 
@@ -273,7 +276,6 @@ class ResolvedVelocity:
                 "speed": torch.tensor(self.speed, dtype=torch.float64)}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Inverse of `state_dict`."""
         modes = state["modes"].to(self.grid.dtype.to_complex())
         self._moments = [_Moment(float(time), *pair) for time, pair in zip(state["times"], modes)]
         self.speed = float(state["speed"])
@@ -290,9 +292,9 @@ class ResolvedVelocity:
         if start is not None:
             flow = replace(flow, velocity=start)
         missing = flow.missing()
-        right = self._descent(flow, missing)
+        right = self.equations.descent(missing, flow.points, flow.velocity)
         begin = self.equations.size(right, count)
-        tolerance = self.tolerance if start is None else self.tolerance_foreseen
+        tolerance = self.tolerance if start is None else self.tolerance_predicted
         if begin > square and start is not None:  # the prediction is worse than zero
             return self._solved(replace(flow, velocity=torch.zeros_like(start)), None, count, square)
         change = self._change(flow, right, count, tolerance**2 * square)
@@ -305,16 +307,11 @@ class ResolvedVelocity:
     def _change(self, flow: ResolvedFlow, right: Tensor, count: float, enough: float) -> Solution:
         return self.equations.solve(flow.points, right, count, enough, self.iterations, self.most_iterations)
 
-    def _descent(self, flow: ResolvedFlow, missing: Tensor) -> Tensor:
-        """Half the steepest descent, P B^T (v - B u) - (sigma^2/P_k) u, zero at the minimum; `missing` = v - B u."""
-        return self.equations.descent(missing, flow.points, flow.velocity)
-
     def _adjoint(self, flow: ResolvedFlow) -> Callable[[Tensor], Tensor]:
-        """Function from the gradient by modes of the minimum to the gradient by the descent there.
+        """Function from the gradient by modes of the minimum to the gradient by the descent d(u; x, v) there.
 
-        It follows from the implicit function theorem. The descent d(u; x, v) vanishes at the minimum and changes with u
-        by -A, so du = A^-1 dd. A is symmetric in the inner product that weights modes by their multiplicity m. Its
-        transpose is therefore m A (1/m).
+        d vanishes at the minimum and changes with u by -A, so du = A^-1 dd (implicit function theorem). A is symmetric
+        in the inner product that weights modes by their multiplicity m. Its transpose is therefore m A (1/m).
         """
         grid, count = self.grid, float(global_sum(self.grid.decomposition.comm, len(flow.relative_velocity)))
 
@@ -331,20 +328,13 @@ class ResolvedVelocity:
 
         return solve
 
-    def _require_reach(self, particles: ParticleSet) -> None:
-        reach = self.grid.reach
-        if farthest_outside(self.grid.decomposition, particles) >= reach:
-            raise HaloError(f"a particle is farther than {reach:.3g} outside its slab before it can change rank, "
-                            "beyond the ghost planes: shorten the time step or the skin")
 
-
-@dataclass(frozen=True)
-class _Moment:
+class _Moment(NamedTuple):
     """Modes of the resolved velocity and of its rate of change at a time."""
 
     time: float
     velocity: Tensor
-    rate: Tensor = field(repr=False)
+    rate: Tensor
 
 
 class _Solution(torch.autograd.Function):

@@ -11,7 +11,6 @@ import math
 from collections.abc import Sequence
 from typing import Protocol
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -25,7 +24,7 @@ KNOTS = 129
 
 
 class SmoothingKernel(Protocol):
-    """W(r) and dW/dr for distances of any shape, zero for r >= `support`.
+    """W(r) in 1/length^3 and dW/dr in 1/length^4 for distances of any shape, zero for r >= `support`.
 
     With a `mean_volume` V = L^3/N, W may be negative, and <A> = V sum_j A_j W, Eq. 6 as published. Without one, W is
     nowhere negative, volumes are V_j = 1/sum_k W, and averages are normalised.
@@ -48,7 +47,7 @@ class SmoothingKernel(Protocol):
 
 
 class _Polynomial:
-    """Kernel from a shape W h^3 and its slope, functions of q = r/h on [0, 1)."""
+    """SmoothingKernel from a shape W h^3 and its slope, functions of q = r/h on [0, 1)."""
 
     mean_volume = None
     shape_pieces: tuple[tuple[float, ...], ...]
@@ -58,15 +57,12 @@ class _Polynomial:
 
     @property
     def pieces(self) -> Tensor:
-        """Coefficients of W; see SmoothingKernel."""
         return torch.tensor(self.shape_pieces, dtype=torch.float64) / self.support**3
 
     def value(self, distance: Tensor) -> Tensor:
-        """W(r) in 1/length^3, of the shape of `distance`."""
         return self._shape(torch.clamp(distance / self.support, max=1)) / self.support**3
 
     def derivative(self, distance: Tensor) -> Tensor:
-        """dW/dr in 1/length^4, of the shape of `distance`."""
         return self._slope(torch.clamp(distance / self.support, max=1)) / self.support**4
 
 
@@ -97,11 +93,11 @@ class WendlandC2(_Polynomial):
 
 def over_distance(slope: Tensor, distance: Tensor) -> Tensor:
     """W'/r, which is 0 for coincident particles since the slope vanishes at r = 0."""
-    return slope / distance.clamp(min=torch.finfo(distance.dtype).tiny)
+    return slope / torch.where(distance > 0, distance, 1.0)
 
 
 class HermiteKernel:
-    """Kernel tabulated at uniform knots q = r/h = 0 ... 1, with cubic Hermite polynomials (C1) between them.
+    """SmoothingKernel tabulated at uniform knots q = r/h = 0 ... 1, with cubic Hermite polynomials (C1) between them.
 
     Parameters
     ----------
@@ -123,7 +119,6 @@ class HermiteKernel:
         return start, first, 3 * rise - 2 * first - last, first + last - 2 * rise
 
     def value(self, distance: Tensor) -> Tensor:
-        """W(r) in 1/length^3, of the shape of `distance`."""
         inside, cell, t = self._locate(distance)
         a, b, c, d = self._at(cell)
         value = a + t * (b + t * (c + t * d))
@@ -132,7 +127,6 @@ class HermiteKernel:
         return torch.where(inside, value, torch.zeros_like(value)) / self.support**3
 
     def derivative(self, distance: Tensor) -> Tensor:
-        """dW/dr in 1/length^4, of the shape of `distance`."""
         inside, cell, t = self._locate(distance)
         _, b, c, d = self._at(cell)
         slope = (b + t * (2 * c + t * (3 * d))) * self.cells
@@ -140,7 +134,6 @@ class HermiteKernel:
 
     @property
     def pieces(self) -> Tensor:
-        """Coefficients of W; see SmoothingKernel."""
         cubics = self._cubics(self.values[1:], self.values[:-1], -self.slopes[1:], -self.slopes[:-1])
         return torch.stack(cubics, dim=1) / self.support**3
 
@@ -164,7 +157,6 @@ class HermiteKernel:
         return distance < self.support, cell, torch.clamp(position - cell, max=1)
 
     def _at(self, cell: Tensor) -> list[Tensor]:
-        """The coefficients of each cell."""
         flat = cell.flatten()
         return [coefficient.index_select(0, flat).reshape(cell.shape) for coefficient in self._coefficients]
 
@@ -195,14 +187,10 @@ class KernelNetwork(nn.Module):
         super().__init__()
         self.support, self.cutoff, self.mean_volume = support, cutoff, mean_volume
         self.network = DenseNetwork(1, hidden, 1, seed)
+        self.positive = mean_volume is None
         if self.positive:
             with torch.no_grad():
                 self.network.weights[-1].mul_(0.1)
-
-    @property
-    def positive(self) -> bool:
-        """Whether W is nowhere negative, unlike the published form."""
-        return self.mean_volume is None
 
     @property
     def formula(self) -> str:
@@ -241,14 +229,10 @@ class KernelNetwork(nn.Module):
 
 
 def integral(kernel: SmoothingKernel) -> Tensor:
-    """Integral of a kernel over space, 4 pi int r^2 W dr, by Gauss-Legendre quadrature with 4 points a panel.
-
-    It is exact for the kernels here, polynomials of degree 5 or less in each panel.
-    """
-    tabulated = isinstance(kernel, HermiteKernel)
-    values, panels = (kernel.values, kernel.cells) if tabulated else (torch.empty(0, dtype=torch.float64), 64)
-    nodes, weights = (torch.as_tensor(part).to(values) for part in np.polynomial.legendre.leggauss(4))
-    width = kernel.support / panels
-    starts = torch.arange(panels, dtype=nodes.dtype, device=nodes.device).unsqueeze(1)
-    distance = (starts + (nodes + 1) / 2) * width
-    return 4 * math.pi * (distance**2 * kernel.value(distance) * weights).sum() * (width / 2)
+    """Integral of a kernel over space, 4 pi int r^2 W dr, exact for its polynomials."""
+    pieces = kernel.pieces
+    end = torch.arange(1, len(pieces) + 1, dtype=pieces.dtype, device=pieces.device).unsqueeze(1)
+    power = torch.arange(1, pieces.shape[1] + 1, dtype=pieces.dtype, device=pieces.device)
+    # int_0^1 u^(power - 1) (end - u)^2 du, with r = end - u in units of the length of a piece
+    moments = end**2 / power - 2 * end / (power + 1) + 1 / (power + 2)
+    return 4 * math.pi * (kernel.support / len(pieces)) ** 3 * (moments * pieces).sum()

@@ -54,7 +54,8 @@ class ColumnPass:
         if key not in self._plans:
             given, result = (self._zeros(key[1]) for _ in range(2))
             plan = _plan(given, result, 0, direction)
-            self._plans[key] = ColumnPlan(plan, *map(self.copies.described_column, (given, result)))
+            described = (self.copies.described(column, gaps=True) for column in (given, result))
+            self._plans[key] = ColumnPlan(plan, *described)
         return self._plans[key]
 
     def _zeros(self, rows: int) -> np.ndarray:
@@ -95,9 +96,9 @@ class PlanePass:
         blocks = [slice(start, min(start + size, even)) for start in range(0, even, size)]
         return blocks if even == count else [*blocks, slice(even, count)]
 
-    def to_physical(self, packed: Sequence[Part], fields: int, pairs: int) -> PlanePlans:
-        """Transform the packed modes of `fields` fields, given in parts, to their planes."""
-        plans = self.plans("BACKWARD", fields, pairs)
+    def to_physical(self, packed: Sequence[Part], fields: int, planes: slice) -> PlanePlans:
+        """Transform the packed modes of `fields` fields, given in parts, to a block of planes."""
+        plans = self.plans("BACKWARD", fields, planes)
         parts = (part if isinstance(part, tuple) else (None, part) for part in packed)
         filled = itertools.chain.from_iterable(self.copies.filled(part, factors, plans.rows) for factors, part in parts)
         for of_field, _ in zip(plans.plans, filled):
@@ -113,9 +114,9 @@ class PlanePass:
                 plan.execute()
             self.copies.unpack(plans.rows, blocks, number, planes)
 
-    def plans(self, direction: str, fields: int, pairs: int) -> PlanePlans:
-        """Return the plans for a number of fields and pairs; equal arguments share plans and memory."""
-        key = (direction, fields, pairs)
+    def plans(self, direction: str, fields: int, planes: slice) -> PlanePlans:
+        """Return the plans for fields on a block of planes; blocks of equal size share plans and memory."""
+        key = (direction, fields, (planes.stop - planes.start + 1) // 2)
         if key not in self._plans:
             self._plans[key] = self._planned(*key)
         return self._plans[key]

@@ -5,11 +5,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from eddies.kernels.library import require
 from eddies.parallel.migration import Redistribution
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition, block_starts
 from eddies.parallel.transpose import Transpose
-from eddies.spectral.fourier_passes import ColumnPass, Part, PlanePass, PlanePlans
+from eddies.spectral.fourier_passes import ColumnPass, Part, PlanePass
 from eddies.spectral.mode_operators import ModeOperators
 
 REAL = {"float64": np.float64, "float32": np.float32}
@@ -88,14 +89,14 @@ class SpectralGrid(ModeOperators):
 
     def forward(self, physical: np.ndarray) -> np.ndarray:
         """Return the modes (c, kz, ky_local, kx) of a real field (c, z_local, y, x); `backward` is the inverse."""
-        collected, copies = Collector(self, len(physical)), self.plane_pass.copies
-        given = copies.described(np.require(physical, self.real, "CW"))
+        copies, blocks = self.plane_pass.copies, self._batch("forward", len(physical)).planes
+        given = self._described(physical, self.real, self.physical_shape)
         for planes in self.plane_pass.blocks(self.decomposition.count):
-            plans = collected.plans(1, planes)
+            plans = self.plane_pass.plans("FORWARD", 1, planes)
             for component in range(len(physical)):
                 copies.join(given, component, planes, plans.planes[0])
-                collected.add(planes, plans, component)
-        return collected.modes()
+                self.plane_pass.to_modes(plans, blocks, component, planes)
+        return self._planes_to_columns(len(physical))
 
     def backward(self, spectral: np.ndarray) -> np.ndarray:
         """Return the real field (c, z_local, y, x) of modes (c, kz, ky_local, kx); the inverse of `forward`."""
@@ -104,7 +105,7 @@ class SpectralGrid(ModeOperators):
         result = copies.described(physical)
         for planes, packed in self._packed_blocks(spectral):
             for component in range(len(physical)):
-                plans = self.plane_pass.to_physical([packed[component : component + 1]], 1, packed.shape[1])
+                plans = self.plane_pass.to_physical([packed[component : component + 1]], 1, planes)
                 copies.split(plans.planes[0], result, component, planes)
         return physical
 
@@ -115,12 +116,12 @@ class SpectralGrid(ModeOperators):
         `product(values, out)` gets the values (fields, pairs, y, 2 x) of the fields that `blocks` yields for the same
         arguments, and fills `out` (results, pairs, y, 2 x).
         """
-        collected = Collector(self, results)
+        blocks = self._batch("forward", results).planes
         for planes, values in self._value_blocks(spectral, **fields):
-            plans = collected.plans(results, planes)
+            plans = self.plane_pass.plans("FORWARD", results, planes)
             product(values, plans.values)
-            collected.add(planes, plans)
-        return collected.modes()
+            self.plane_pass.to_modes(plans, blocks, 0, planes)
+        return self._planes_to_columns(results)
 
     def squares(self, vector: np.ndarray) -> np.ndarray:
         """Return the modes (6, kz, ky_local, kx) of u_i u_j, ij = xx, yy, zz, xy, xz, yz, of a vector's modes."""
@@ -154,7 +155,7 @@ class SpectralGrid(ModeOperators):
         """Yield blocks of planes and values (fields, pairs, y, 2 x); a single plane is its own partner."""
         for planes, packed in self._packed_blocks(spectral, z_derivatives):
             parts = [packed] if expand is None else expand(packed)
-            yield planes, self.plane_pass.to_physical(parts, fields, packed.shape[1]).values
+            yield planes, self.plane_pass.to_physical(parts, fields, planes).values
 
     def _packed_blocks(self, spectral: np.ndarray, z_derivatives: int = 0) -> Iterator[tuple[slice, np.ndarray]]:
         copies = self.plane_pass.copies
@@ -165,8 +166,8 @@ class SpectralGrid(ModeOperators):
     def _columns_to_planes(self, spectral: np.ndarray, z_derivatives: int) -> _Batch:
         """Transform components and the z derivatives of the first of them along z, and redistribute them to planes."""
         components, copies = len(spectral), self.column_pass.copies
-        batch = self.batch("backward", components + z_derivatives)
-        modes = copies.described(np.require(spectral, self.complex, "CW"))
+        batch = self._batch("backward", components + z_derivatives)
+        modes = self._described(spectral, self.complex, self.spectral_shape)
         d_dz = copies.described((1j * self.wavevector[2].ravel()).astype(self.complex))
         fields = [(component, None) for component in range(components)]
         fields += [(component, d_dz) for component in range(z_derivatives)]
@@ -179,7 +180,27 @@ class SpectralGrid(ModeOperators):
         batch.transpose.to_planes()
         return batch
 
-    def batch(self, direction: str, components: int) -> _Batch:
+    def _described(self, array: np.ndarray, dtype: type, shape: tuple[int, ...]) -> Any:
+        """An array of the caller in the form that the copies take. Raises ValueError for another shape."""
+        array = np.require(array, dtype, "CW")
+        require(array, (len(array), *shape), dtype)
+        return self.plane_pass.copies.described(array)
+
+    def _planes_to_columns(self, components: int) -> np.ndarray:
+        """Redistribute the components of the "forward" batch to columns, and transform them along z: their modes."""
+        batch, copies = self._batch("forward", components), self.column_pass.copies
+        batch.transpose.to_columns()
+        spectral = np.empty((components, *self.spectral_shape), self.complex)
+        result = copies.described(spectral)
+        for rows in self.column_pass.rows(self.spectral_shape[1]):
+            column = self.column_pass.plan("FORWARD", rows)
+            for component in range(components):
+                copies.receive(batch.columns, component, rows, column.given)
+                column.plan.execute()
+                copies.store(column.result, 0.5 / self.cells**3, result, component, rows)
+        return spectral
+
+    def _batch(self, direction: str, components: int) -> _Batch:
         """Return the memory in which a batch of components is sent. One transform at a time uses a direction."""
         key = (direction, components)
         if key not in self._batches:
@@ -197,36 +218,6 @@ class SpectralGrid(ModeOperators):
         """Return the mean over the box of each component of (c, z_local, y, x); shape (c,)."""
         total = global_sum(self.decomposition.comm, physical.sum(axis=(1, 2, 3), dtype=np.float64))
         return total / self.cells**3
-
-
-class Collector:
-    """Accepts real fields one block of planes at a time and returns their modes."""
-
-    def __init__(self, grid: SpectralGrid, components: int) -> None:
-        self.grid, self.components = grid, components
-        self._batch = grid.batch("forward", components)
-
-    def plans(self, fields: int, planes: slice) -> PlanePlans:
-        """Return plans for a block of planes, with memory to be filled with the values of `fields` fields."""
-        return self.grid.plane_pass.plans("FORWARD", fields, (planes.stop - planes.start + 1) // 2)
-
-    def add(self, planes: slice, plans: PlanePlans, component: int = 0) -> None:
-        """Transform a filled block of planes along x and y; its fields are the components from `component` on."""
-        self.grid.plane_pass.to_modes(plans, self._batch.planes, component, planes)
-
-    def modes(self) -> np.ndarray:
-        """Return the modes (components, kz, ky_local, kx) after all planes have been added; collective."""
-        grid, copies = self.grid, self.grid.column_pass.copies
-        self._batch.transpose.to_columns()
-        spectral = np.empty((self.components, *grid.spectral_shape), grid.complex)
-        result = copies.described(spectral)
-        for rows in grid.column_pass.rows(grid.spectral_shape[1]):
-            column = grid.column_pass.plan("FORWARD", rows)
-            for component in range(self.components):
-                copies.receive(self._batch.columns, component, rows, column.given)
-                column.plan.execute()
-                copies.store(column.result, 0.5 / grid.cells**3, result, component, rows)
-        return spectral
 
 
 def regrid(source: SpectralGrid, target: SpectralGrid, spectral: np.ndarray) -> np.ndarray:

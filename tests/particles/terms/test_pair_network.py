@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from eddies.particles.flow_units import FlowUnits
-from eddies.scene.values import SceneError
 from tests.particles.configurations import (
-    CUTOFF, FLOW, LENGTH, NEIGHBORS, PAIR_MODELS, SCALES, along, given, model, positions, rates, scaled_pairs, state,
+    CUTOFF, FLOW, LENGTH, NEIGHBORS, PAIR_MODELS, SCALES, given, model, positions, rates, scaled_pairs, state,
 )
 
 pytestmark = pytest.mark.mpi(1)
@@ -74,8 +73,6 @@ def test_neighbours_fade_out_at_the_cutoff(terms):
 
 
 DEGENERATE = {
-    "coincident": lambda: (positions("coincident", 5), *state(5)[1:]),
-    "equal velocities": lambda: (positions(count=50), torch.ones(50, 3, dtype=torch.float64), state(50)[2]),
     "alone": lambda: state(1),
     "coplanar": lambda: (positions(count=30) * torch.tensor([1, 1, 0]), *state(30)[1:]),
     "all the same": lambda: tuple(column[:1].expand(4, *column.shape[1:]).clone() for column in state(4)),
@@ -93,30 +90,6 @@ def test_degenerate_states_have_finite_rates_and_gradients(terms, case):
     assert all(gradient is None or torch.isfinite(gradient).all() for gradient in gradients)
     if case == "alone":
         assert all((rate == 0).all() for name, rate in result.items() if name != "density")
-
-
-@every_model
-def test_gradient_against_finite_differences(terms):
-    force, particles = model(terms), [column.requires_grad_() for column in state(12)]
-    parameters = list(force.parameters())
-    inputs = [*particles, *parameters]
-    # Units in which no rate dominates.
-    typical = {name: rate.detach().square().mean() for name, rate in given(rates(force, *particles)).items()}
-
-    def total(position, velocity, density, *values):
-        with torch.no_grad():
-            for parameter, value in zip(parameters, values):
-                parameter.copy_(value)
-        return sum((rate**2).sum() / typical[name]
-                   for name, rate in given(rates(force, position, velocity, density)).items())
-
-    generator = torch.manual_seed(6)
-    direction = [torch.randn(x.shape, dtype=x.dtype, generator=generator) for x in inputs]
-    direction[2] = direction[2] * SCALES.density
-    gradients = torch.autograd.grad(total(*particles), inputs, materialize_grads=True)
-    expected = sum((gradient * d).sum() for gradient, d in zip(gradients, direction)).item()
-    start = [x.detach().clone() for x in inputs]
-    assert along(total, start, direction, 1e-5).item() == pytest.approx(expected, rel=1e-6)
 
 
 class Constant(torch.nn.Module):
@@ -170,13 +143,6 @@ def test_antisymmetric_forces_of_a_pair_are_exactly_opposite():
         assert torch.equal(first, -second) and first.norm() > 1e-3
         first, second = rates(other, position, velocity, density).acceleration
         assert (first + second).norm() > 1e-6
-
-
-@pytest.mark.parametrize("choice, value", [("basis", "other"), ("inputs", ("place",)), ("hidden", ()),
-                                           ("symmetry", "antisymmetric")])
-def test_impossible_settings_are_refused(choice, value):
-    with pytest.raises(SceneError, match=choice):
-        model(pairs={choice: value})
 
 
 def test_inputs_of_the_network():

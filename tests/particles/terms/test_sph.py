@@ -119,16 +119,6 @@ def test_viscosity_acts_on_approaching_pairs_and_dissipates_energy(comm):
 
 
 @one_rank
-def test_coincident_particles_do_not_repel_each_other(comm):
-    for distance in (0.0, 1e-300, 1e-16, 1e-8):
-        # At the origin, where the smallest of these distances can be represented.
-        position = torch.tensor([[0.0, 1, 1], [distance, 1, 1], [0.5, 1, 1]], dtype=torch.float64)
-        density = summed_density(position, CubicSpline(SUPPORT), MASS)
-        found = acceleration(position, torch.zeros_like(position), density)
-        assert torch.isfinite(found).all() and (found[0] - found[1]).abs().max() < 1e-6 * found[2].abs().max()
-
-
-@one_rank
 def test_sound_has_the_frequency_c_k(comm):
     """A standing wave with sin kx, k = 1, over three quarters of a period. The sums see the smoothed wave, whose
     amplitude is the kernel's Fourier transform, 0.92. Sums over 57 neighbours are integrals to two percent."""
@@ -147,24 +137,6 @@ def test_sound_has_the_frequency_c_k(comm):
     r = torch.linspace(0, FLOW.cutoff, 2001, dtype=torch.float64)
     left = float(torch.trapezoid(4 * math.pi * r * torch.sin(r) * CubicSpline(FLOW.cutoff).value(r), r))
     assert 0.88 < left < 0.95 and np.unwrap(phases)[-1] == pytest.approx(1.5 * math.pi * left, rel=0.02)
-
-
-@one_rank
-def test_energy_is_conserved_without_viscosity_and_falls_with_it(comm):
-    position = lattice(SIDE, 0.2)
-    velocity = torch.sin(position[:, [1, 2, 0]])
-    slab, start = alone(position, velocity, ONES)
-    lost = {}
-    for alpha in (0.0, 1.0):
-        force = model({"continuity": {}, "wcsph": dict(alpha=alpha, beta=0.0)}, FLOW)
-        stepper, particles = INTEGRATORS["rk4"](dynamics_of(slab, force, 0.1)), start
-        with torch.no_grad():
-            for _ in range(10):
-                particles = stepper.step(particles, 0.01)
-        rho = particles.density
-        energy = particles.velocity.square().sum() / 2 + (C**2 * (rho.log() + 1 / rho - 1)).sum()
-        lost[alpha] = 1 - float(energy) / float(velocity.square().sum() / 2)
-    assert abs(lost[0.0]) < 1e-4 and lost[1.0] > 0.05
 
 
 @one_rank
@@ -200,8 +172,8 @@ def test_parameters_are_recovered_from_trajectories(comm):
         return total
 
     optimiser.step(loss)
-    found = {name: value.item() for name, value in term.named_parameters()}
-    assert found == pytest.approx({"sound_speed": 2.0, "alpha": 2.0, "beta": 2.0}, rel=0.01)
+    learned = {name: value.item() for name, value in term.named_parameters()}
+    assert learned == pytest.approx({"sound_speed": 2.0, "alpha": 2.0, "beta": 2.0}, rel=0.01)
 
 
 # ---- transport velocity

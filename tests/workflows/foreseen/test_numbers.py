@@ -102,8 +102,8 @@ def test_runs_take_the_steps_and_bytes_that_are_expected(comm, folder, overrides
     assert rollout.evaluations == found.get("evaluations", 0)
     with h5py.File(folder / "ground_truth.h5") as file:
         frames = len(file["particles/tracers/time"])
-    flow, tracers, whole = scene.flow, scene.tracers, len(whole_frames(scene.simulation, scene.training, scene.tracers.field_every,
-                                                                  frames))
+    flow, tracers = scene.flow, scene.tracers
+    whole = len(whole_frames(scene.simulation, scene.training, tracers.field_every, frames))
     # A third of files this small is headers and text.
     for name, size in (("rollout", rollout_bytes(tracers.particles, rollout.intervals + 1)),
                        ("ground_truth", trajectory_bytes(flow, tracers, frames, whole))):

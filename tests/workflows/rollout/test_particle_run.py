@@ -114,7 +114,7 @@ def test_frames_between_steps_of_free_particles_lie_on_straight_lines(comm, smal
 
 @pytest.mark.mpi(1)
 def test_frames_of_long_steps_are_those_of_short_ones(comm, small_products, linked, monkeypatch):
-    for name in ("tolerance", "tolerance_foreseen"):
+    for name in ("tolerance", "tolerance_predicted"):
         monkeypatch.setattr(ResolvedVelocity, name, 1e-8)
     scene, directory, found = small_products[0], linked(small_products[1]), {}
     for step in (0.01, 0.03, 0.1):

@@ -9,7 +9,7 @@ from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.pairs import CompiledSum, ScaledPairs
 from eddies.particles.rates import Rates
-from eddies.particles.terms.pair_basis import (
+from eddies.particles.terms.pair_network import (
     SMALL, acceleration, along_separation, compiled_switches, density_rate, separation_direction, window,
 )
 from eddies.particles.terms.term import Coefficient, PairTerm
@@ -50,7 +50,6 @@ class EddyViscosity(PairTerm):
                                scales.acceleration * per_rate**2)]
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
-        """w Pi b_1, (3, m)."""
         form, approach = self.settings.form, pairs.approach
         mu = (torch.tanh(approach) if form == "bounded" else approach) / (pairs.distance**2 + SOFTENING)
         if form == "monaghan":
@@ -96,7 +95,6 @@ class DensityDiffusion(PairTerm):
                                "L^7/(M T)", rate * per_difference**2)]
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
-        """-w (|b_1| + |b_2| |q|) q, (1, m)."""
         own, other = pairs.densities
         q = (own - other) / (pairs.distance**2 + SOFTENING)
         linear, quadratic = self.coefficients.abs()

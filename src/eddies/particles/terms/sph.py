@@ -35,7 +35,6 @@ class _SPHTerm(PairTerm):
         self.c = flow.scales.required("sound_speed")
 
     def slope(self, listed: Pairs) -> Tensor:
-        """m W'/r of each pair, (m,)."""
         return self.mass * over_distance(self.kernel.derivative(listed.distance), listed.distance)
 
     def densities(self, pairs: ScaledPairs) -> tuple[Tensor, Tensor]:
@@ -122,12 +121,10 @@ class WCSPH(_SPHTerm):
                 Coefficient.of("|beta|", self.beta.abs(), "quadratic artificial viscosity")]
 
     def pressure(self, density: Tensor) -> Tensor:
-        """P of densities of any shape."""
         c, gamma, rho_0 = self.c * self.sound_speed, self.settings.exponent, self.flow.scales.density_mean
         return c**2 * rho_0 / gamma * ((density / rho_0) ** gamma - 1)
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
-        """Acceleration of i by j, (3, m)."""
         listed, (own, other) = pairs.pairs, self.densities(pairs)
         push = self.pressure(own) / own**2 + self.pressure(other) / other**2
         h, x = self.kernel.support / 2, listed.displacement.T

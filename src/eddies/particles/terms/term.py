@@ -4,27 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor, nn
 
-from eddies.particles.context import Context
+from eddies.particles.context import Context, PairSum
 from eddies.particles.flow_units import FlowUnits
-from eddies.particles.pairs import CompiledSum, ScaledPairs
 from eddies.particles.rates import Rates
 from eddies.scene.terms import TermBase, TermSettings
 
 
 @dataclass(frozen=True)
 class Coefficient:
-    """A learned coefficient of a term, for reports.
+    """A learned coefficient of a term, for reports: symbol, dimensionless parameter(s), and their effect in words.
 
-    Parameters
-    ----------
-    name : its symbol.
-    learned : the dimensionless parameter, a number or several.
-    value : the same in `unit`, for the flow that the term was made for.
-    unit : in L, T and M (eddies.io.quantities); "1" for a pure number.
-    meaning : its effect, in words.
+    `value` is the parameter in `unit` for the flow of the term. Units are in L, T and M (eddies.io.quantities); "1" for
+    a pure number.
     """
 
     name: str
@@ -45,13 +38,8 @@ class Term(nn.Module, TermBase):
 
     A user's term derives from it, declares on its class of `Settings` what it reads and gives, and computes its
     contribution in `forward`, in the units of `context.flow`. All ranks evaluate a term together, also ranks without
-    particles.
-
-    Attributes
-    ----------
-    Settings : class of the settings, a frozen dataclass derived from TermSettings.
-    linear : true if the rates at given particles are a linear function of the parameters plus a constant. Training then
-        stores the effect of each parameter at a moment instead of computing it at every step.
+    particles. A term is `linear` if the rates at given particles are a linear function of the parameters plus a
+    constant. Training then stores the effect of each parameter at a moment instead of computing it at every step.
     """
 
     Settings: type[TermSettings] = TermSettings
@@ -72,37 +60,18 @@ class Term(nn.Module, TermBase):
         raise NotImplementedError(f"{type(self).__name__} has no forward(context)")
 
 
-class PairTerm(Term):
-    """A term that sums `pair_values` over the neighbours within the radius of interaction.
+class PairTerm(Term, PairSum):
+    """A term that is a sum over pairs; see PairSum. `needs_moments` tells whether `rates_of` uses `context.moments`.
 
     The sums of several such terms are taken together over the same pairs. If terms give a density that others read,
     there are two such passes. The rates belong to the requested particles, in training some of the owned ones.
-
-    Attributes
-    ----------
-    width : largest number of values held for a pair at once; it determines how many pairs are taken together.
-    needs_moments : whether `rates_of` uses `context.moments`.
-    mutual : whether j gets from i what i gets from j times `parity`. Each pair is then evaluated once.
-    parity : (components,), 1 or -1.
     """
 
-    width = 8
     needs_moments = False
-    mutual = False
-    parity: Tensor = torch.ones(1)
-
-    def pair_values(self, pairs: ScaledPairs) -> Tensor:
-        """Values to sum over neighbours, (components, m). They must vanish beyond the radius of interaction."""
-        raise NotImplementedError(f"{type(self).__name__} has no pair_values(pairs)")
-
-    def compiled(self, context: Context) -> CompiledSum | None:
-        """The same sum for the compiled library, or None. Each class must define it itself; it is not inherited."""
-        return None
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """Contribution from the sums (components, k) over each particle's neighbours."""
         raise NotImplementedError(f"{type(self).__name__} has no rates_of(sums, context)")
 
     def forward(self, context: Context) -> Rates:
-        """Contribution to the requested particles; collective."""
         return self.rates_of(context.pair_sums(self), context)

@@ -88,7 +88,7 @@ class TrainingData:
             resolution = ResolvedVelocity.on_slabs(slab, self.model.flow, drift, self.dtype)
         if resolution is not None:
             # Gradients are with respect to the particles alone, so an extrapolated start may not affect the result.
-            resolution.tolerance_foreseen = resolution.tolerance
+            resolution.tolerance_predicted = resolution.tolerance
         starts = evenly(self.learned - self.longest + 1, self.count)
         windows = [self._window(start, resolution) for start in starts]
         substeps = round(interval / (settings.time_step or interval))
