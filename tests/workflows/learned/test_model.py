@@ -16,7 +16,7 @@ from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene.scene import Model, SceneError, load_scene
 from eddies.scene.terms import PRESETS
 from eddies.workflows.learned.model import (initial_model, load_form, load_kernel, load_model,
-                                            require_same_parameters)
+                                            take_from_first_rank)
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 from eddies.workflows.train_kernel import keep_form
@@ -108,34 +108,47 @@ def test_a_class_of_the_user_that_cannot_be_made_is_one_error(comm, own, body, w
     assert str(error.value).startswith(f"[model] terms: {where}")
 
 
-def parameters_on(rank):
-    """Parameters and buffers that are the same on all ranks, also of types that numpy or MPI lack."""
+def parameters(rank):
+    """Parameters and buffers that differ between ranks, also of types that numpy or MPI lack."""
     model = nn.Module()
-    model.drawn = nn.Parameter(torch.tensor([[0.5, 2.0]]))
+    model.kept = nn.Parameter(torch.ones(2))
+    model.drawn = nn.Parameter(torch.full((2, 3), rank + 0.5))
     for name in ("bfloat16", "float16", "complex64"):
-        model.register_buffer(f"in_{name}", torch.full((), 0.5, dtype=getattr(torch, name)))
+        model.register_buffer(f"in_{name}", torch.full((), rank + 0.5, dtype=getattr(torch, name)))
     return model
 
 
 @pytest.mark.mpi(2)
+def test_all_ranks_take_the_values_of_the_first(comm, caplog):
+    model = parameters(comm.rank)
+    take_from_first_rank(model, comm)
+    assert (model.kept == 1).all() and (model.drawn == 0.5).all()
+    assert all(buffer.item() == 0.5 and buffer.ndim == 0 for buffer in model.buffers())
+    warnings = [record.getMessage() for record in caplog.records]
+    assert len(warnings) == (comm.rank == 0)
+    assert all("of drawn, in_bfloat16, in_float16, in_complex64 differ" in line for line in warnings)
+
+
+@pytest.mark.mpi(2)
 @pytest.mark.parametrize("drawn, message", [
-    (lambda rank: nn.Parameter(torch.tensor([[0.5, 2.0 + 1e-6 * rank]])), "drawn differs on rank 1"),
-    (lambda rank: nn.Parameter(torch.ones(3 + rank)), "drawn differs on rank 1"),
-    (lambda rank: nn.Parameter(torch.ones(3), requires_grad=rank == 0), "drawn differs on rank 1"),
-    (lambda rank: nn.UninitializedParameter(), "drawn has no shape")], ids=["value", "shape", "fixed", "lazy"])
-def test_parameters_that_differ_between_ranks_are_refused(comm, drawn, message):
-    """Ranks that register them in another order are refused too: gradients are summed over ranks in that order."""
-    model = parameters_on(comm.rank)
-    require_same_parameters(model, comm)
-    if comm.rank == 1:
-        model.register_parameter("drawn", model._parameters.pop("drawn"))
-        model.register_buffer("in_bfloat16", model._buffers.pop("in_bfloat16"))
-    with pytest.raises(SceneError, match="in_bfloat16 differs|in_float16 differs"):
-        require_same_parameters(model, comm)
-    model = parameters_on(comm.rank)
+    (lambda rank: nn.Parameter(torch.ones(3 + rank)), r"drawn torch.float32 \[4\] on rank 1"),
+    (lambda rank: nn.Parameter(torch.ones(3), requires_grad=rank == 0), "that is not trained on rank 1"),
+    (lambda rank: nn.UninitializedParameter(), "drawn has no shape")], ids=["shape", "fixed", "lazy"])
+def test_parameters_that_cannot_be_copied_are_refused(comm, drawn, message):
+    model = parameters(comm.rank)
     model.drawn = drawn(comm.rank)
     with pytest.raises(SceneError, match=message):
-        require_same_parameters(model, comm)
+        take_from_first_rank(model, comm)
+
+
+@pytest.mark.mpi(2)
+def test_another_order_of_parameters_on_a_rank_is_refused(comm):
+    """Gradients are summed over ranks in the order of the parameters."""
+    model = parameters(0)
+    if comm.rank == 1:
+        model.register_parameter("kept", model._parameters.pop("kept"))
+    with pytest.raises(SceneError, match="drawn .* on rank 1 is in the place of kept .* on rank 0"):
+        take_from_first_rank(model, comm)
 
 
 NETWORK = KernelNetwork(0.7, [4], seed=3).float()

@@ -15,7 +15,7 @@ from eddies.io.weights import load_weights
 from eddies.learning.losses import relative_error
 from eddies.parallel.reduction import global_sum
 from eddies.particles.model import FORCING
-from eddies.scene.scene import SceneError, load_scene
+from eddies.scene.scene import load_scene
 from eddies.workflows import dns, train
 from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
 from eddies.workflows.ground_truth.frame_counts import last_seen, rollout_start

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import zip_longest
@@ -19,6 +19,7 @@ from eddies.io.hdf5 import ProductError
 from eddies.io.weights import load_weights
 from eddies.parallel.broadcast import first_complaint, share_text
 from eddies.parallel.communicator import Comm
+from eddies.parallel.reduction import any_rank
 from eddies.particles.flow_units import ReferenceScales
 from eddies.particles.forms import Form
 from eddies.particles.model import LagrangianModel, build_model
@@ -28,11 +29,11 @@ from eddies.scene.scene import SceneError
 from eddies.scene.terms import TermError
 from eddies.workflows.learned.source import ModelDefinition
 
-SHAPELESS = "without a shape"  # summary of a parameter of a lazy module
+log = logging.getLogger("eddies")
 
 
 def initial_model(definition: ModelDefinition, scales: ReferenceScales, comm: Comm) -> LagrangianModel:
-    """The model with initial parameters, for a flow of these scales; collective.
+    """The model with initial parameters, equal on all ranks, for a flow of these scales; collective.
 
     Raises SceneError if a class of the user is not a term, cannot be made, or differs between ranks.
     """
@@ -40,32 +41,53 @@ def initial_model(definition: ModelDefinition, scales: ReferenceScales, comm: Co
         model = build_model(definition.model.settings, definition.model.terms, definition.units(scales))
     except TermError as error:
         raise SceneError(f"[model] terms: {error}") from None
-    require_same_parameters(model, comm)
+    take_from_first_rank(model, comm)
     return model
 
 
-def require_same_parameters(model: nn.Module, comm: Comm) -> None:
-    """Raise SceneError on all ranks if a parameter or buffer is not the same on all ranks, or has no shape yet;
-    collective."""
-    own = [[name, _summary(tensor)] for name, tensor in (*model.named_parameters(), *model.named_buffers())]
+def take_from_first_rank(model: nn.Module, comm: Comm) -> None:
+    """Copy parameters and buffers of rank 0 to all ranks, with a warning if they differed; collective.
+
+    Raises SceneError on all ranks if names, their order, shapes, types or `requires_grad` differ between ranks, or if a
+    parameter has no shape yet. Gradients are summed over ranks in this order.
+    """
+    tensors = [*model.named_parameters(), *model.named_buffers()]
+    own = [[name, _form(tensor)] for name, tensor in tensors]
     first = json.loads(share_text(comm, json.dumps(own)))
-    differing = next(((mine or other)[0] for mine, other in zip_longest(own, first) if mine != other), None)
-    shapeless = next((name for name, summary in own if summary == SHAPELESS), None)
-    complaint = first_complaint(comm, differing and (
-        f"{differing} differs on rank {comm.rank} from that on rank 0, in its order, type, shape or initial values; "
-        "draw random numbers from a generator with the seed of the flow (flow.seed)"))
-    if complaint is None and shapeless is not None:
-        complaint = f"{shapeless} has no shape yet, as in a lazy module; give the module its sizes"
+    wrong = next(((mine, other) for mine, other in zip_longest(own, first, fillvalue=["", "nothing"])
+                  if mine != other), None)
+    complaint = first_complaint(comm, wrong and (
+        f"[model] terms: {' '.join(wrong[0]).strip()} on rank {comm.rank} is in the place of "
+        f"{' '.join(wrong[1]).strip()} on rank 0; register the same on all ranks, in the same order"))
     if complaint is not None:
-        raise SceneError(f"[model] terms: {complaint}")
+        raise SceneError(complaint)
+    shapeless = next((name for name, tensor in tensors if is_lazy(tensor)), None)
+    if shapeless is not None:
+        raise SceneError(f"[model] terms: {shapeless} has no shape yet, as in a lazy module; give the module its sizes")
+    differing = []
+    for name, tensor in tensors:
+        values = tensor.detach().cpu().contiguous()
+        given = values.clone()
+        comm.Bcast(_bytes(given))
+        if any_rank(comm, not np.array_equal(_bytes(given), _bytes(values))):
+            differing.append(name)
+            with torch.no_grad():
+                tensor.copy_(given)
+    if differing and comm.rank == 0:
+        log.warning("model: initial values of %s differ between ranks; all ranks take those of rank 0. Draw random "
+                    "numbers from a generator with the seed of the flow (flow.seed)", ", ".join(differing))
 
 
-def _summary(tensor: torch.Tensor) -> str:
-    """A text that tells whether tensors are the same; works for types that numpy or MPI lack."""
+def _form(tensor: torch.Tensor) -> str:
     if is_lazy(tensor):
-        return SHAPELESS
-    content = tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy()
-    return f"{tensor.dtype} {list(tensor.shape)} {tensor.requires_grad} {hashlib.sha256(content).hexdigest()}"
+        return "without a shape"
+    fixed = isinstance(tensor, nn.Parameter) and not tensor.requires_grad
+    return f"{tensor.dtype} {list(tensor.shape)}" + (" that is not trained" if fixed else "")
+
+
+def _bytes(tensor: torch.Tensor) -> np.ndarray:
+    """The memory of a tensor as bytes, without a copy; works for types that numpy or MPI lack."""
+    return tensor.reshape(-1).view(torch.uint8).numpy()
 
 
 def load_model(definition: ModelDefinition, comm: Comm, path: str | Path, scales: ReferenceScales) -> LagrangianModel:
