@@ -18,7 +18,7 @@ status=0
 "${launcher[@]}" "$checkout/.venv/bin/eddies" "${arguments[@]}" "$@" || status=$?
 if [ "$status" -eq 138 ]; then status=75; fi  # SIGUSR1 came before the ranks could catch it
 if [ "$status" -eq 75 ]; then
-    echo "stopped before the time limit: the same command goes on"
+    echo "stopped before the time limit: the same command continues"
     "${resubmit[@]}" || echo "not queued again, do it by hand: ${resubmit[*]}" >&2
 fi
 exit "$status"

@@ -183,7 +183,7 @@ def test_input_of_other_settings_is_refused(comm, tmp_path, capfd):
 def test_more_ranks_than_slabs_are_refused_before_any_work(comm, tmp_path, capfd):
     coarse = ["--set", "tracers.field_cells=6", "--output", tmp_path / "run"]
     assert run_cli("run", TINY, *coarse) == 2
-    assert one_line(comm, capfd, "2 ranks are more than the 1 that it can use (ghost planes of the filtered fields)")
+    assert one_line(comm, capfd, "2 ranks are more than the limit of 1 (ghost planes of the filtered fields)")
     assert not (tmp_path / "run").exists()
 
 

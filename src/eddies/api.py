@@ -79,7 +79,7 @@ def simulate(scene: Scene | str | Path, *, output: str | Path | None = None, ove
 
 @contextmanager
 def _job(comm: Comm | None) -> Iterator[Comm]:
-    """The communicator of a job, by default that of all ranks.
+    """The communicator of a job, by default the one of all ranks.
 
     Log lines go to standard output unless the program has set up logging. An error that only some ranks meet ends the
     job, because the others may wait for them.

@@ -150,7 +150,7 @@ def add_job_options(parser: argparse.ArgumentParser, output: str) -> None:
 
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:
-    """Add the amount of log lines."""
+    """Add the options that set how much is logged."""
     how_much = parser.add_mutually_exclusive_group()
     how_much.add_argument("--quiet", action="store_const", const="outcome", dest="log",
                           help="log only warnings, and at the end the product and its place")

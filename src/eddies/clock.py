@@ -15,7 +15,7 @@ log = logging.getLogger("eddies")
 YEAR = 365.25 * 86400.0      # seconds
 YEARS = 10                   # from which a duration is given in years
 WARM_UP_STEPS = 2            # first steps, which plan, compile and fill caches; the median leaves them out
-RECENT = 1000                # steps of which the progress line gives the median
+RECENT = 1000                # latest steps, whose median the progress line gives
 
 
 class Clock:

@@ -40,8 +40,8 @@ def check_threads() -> None:
     """Raise ThreadsError where OMP_NUM_THREADS is not a number of threads, or exceeds this machine's processors."""
     number, there = threads(), os.cpu_count() or 1
     if number > there:
-        raise ThreadsError(f"OMP_NUM_THREADS = {number}: this machine has {there} processors, and more threads wait "
-                           f"for one another; set it to {there} or less")
+        raise ThreadsError(f"OMP_NUM_THREADS = {number}: this machine has only {there} processors, and more threads "
+                           f"slow each other down; set it to {there} or less")
 
 
 def default_to_one_thread(environment: MutableMapping[str, str] = os.environ) -> None:

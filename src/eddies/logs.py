@@ -16,8 +16,8 @@ LEVELS = {"debug": logging.DEBUG, "info": logging.INFO, "outcome": OUTCOME, "war
 
 
 def configure_logging(rank: int, level: str | None = None) -> None:
-    """Send the logger "eddies" to standard output. `level` is that of rank 0: debug, info, outcome or warning, by
-    default the value of EDDIES_LOG. Raises UserError if EDDIES_LOG has another value."""
+    """Send the logger "eddies" to standard output. `level` of rank 0 is debug, info, outcome or warning, by default the
+    value of EDDIES_LOG. Raises UserError if EDDIES_LOG has another value."""
     name = level or os.environ.get("EDDIES_LOG", "info")
     if name not in LEVELS:
         raise UserError(f"EDDIES_LOG = {name}: must be one of {', '.join(LEVELS)}")

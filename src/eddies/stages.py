@@ -70,7 +70,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     settings = [scene.to_toml(), *(stage_fingerprint(scene, stage) for stage in scene.stages), str(directory), *stages,
                 *variants]
     require_same(comm, hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:16],
-                 "a scene, stages and a directory of which the SHA-256 is {}")
+                 "a scene, stages and a directory with the SHA-256 {}")
     warn_of_few_processors(comm)
     scene.check_variants(variants)
     check_unseen(scene, directory)
@@ -92,7 +92,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     for step in planned:
         check_inputs(step, comm, making)
     if on_first_rank(comm, lambda: os.path.exists(directory / "STOP")):  # ends a chain of jobs that queues itself again
-        raise SceneError(f"{directory / 'STOP'}: asks the job to stop before it begins; remove the file to go on")
+        raise SceneError(f"{directory / 'STOP'}: asks the job to stop before it begins; remove the file to continue")
     with working_in(comm, directory, stop, take_over):
         for step in planned:
             look_at_work(step, comm, overwrite)
@@ -146,9 +146,9 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
         check_inputs(step, comm)
     work = look_at_work(step, comm, overwrite)
     if has_single_writer(comm):
-        log.info("rank 0 writes for all, up to %s a file, because this h5py has no MPI", in_units(LARGEST_BYTES))
+        log.info("rank 0 writes all files, each at most %s, because this h5py has no MPI", in_units(LARGEST_BYTES))
     if scene.foreign:
-        log.info("%s: uses classes that are not of this package: %s", scene.name, ", ".join(scene.foreign))
+        log.info("%s: uses classes from outside this package: %s", scene.name, ", ".join(scene.foreign))
     checked = False  # whether the ground truth was checked for the stages that need it
     for number, name in enumerate(step.stages):
         stage = STAGES[name]
@@ -207,7 +207,8 @@ def check_sections(stages: Sequence[str], scene: Scene) -> None:
             if stage == "train" and scene.model is not None and scene.simulation is not None:
                 raise SceneError(f'{scene.name}: [simulation] method = "{scene.simulation.method}" needs no trained '
                                  'model; set method = "learned" to train one')
-            raise SceneError(f"{scene.name}: has no [{STAGES[stage].section}], which `eddies {stage}` is about; add it")
+            raise SceneError(f"{scene.name}: `eddies {stage}` needs the section [{STAGES[stage].section}], which is "
+                             "missing; add it")
 
 
 def check_inputs(step: Step, comm: Comm, making: Collection[tuple[str, Path]] = ()) -> None:
@@ -229,7 +230,7 @@ def check_inputs(step: Step, comm: Comm, making: Collection[tuple[str, Path]] = 
         if made_with != stage_fingerprint(scene, needed.name):
             raise SceneError(f"{holder / needed.file}: was made with other settings than this scene's; run "
                              f"`eddies {needed.name} --overwrite` with these, or give `eddies {stages[0]}` the "
-                             "same --set as then")
+                             "--set options of that run")
 
 
 def prepare_directory(scene: str, comm: Comm, directory: Path) -> None:

@@ -95,7 +95,7 @@ class StoredRun:
         return load_scene(self.path / "scene.toml")
 
     def variant(self, name: str) -> StoredRun:
-        """The run of a variant; if the scene has realisations, that of the first."""
+        """The run of a variant; if the scene has realisations, its run on the first realisation."""
         return StoredRun(variant_directory(self.path, name))
 
     @property

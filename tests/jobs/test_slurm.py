@@ -39,7 +39,7 @@ def test_job_is_stopped_queued_again_and_goes_on(slurm, tmp_path):
     slurm.ask("scancel", "--signal=USR1", str(job))  # what --signal does, but for the time
     known, output = end(slurm, job)
     assert (known["JobState"], known["Restarts"]) == ("COMPLETED", "1"), output
-    before, after = output.split("stopped by SIGUSR1; the same command goes on from ")
+    before, after = output.split("stopped by SIGUSR1; the same command continues from ")
     reached = int(re.match(r"step (\d+)\n", after)[1])
     assert "dns: starts on 2 ranks" in before and f"dns: continues from step {reached}, " in after
     assert [int(step) for step in re.findall(r"dns  step (\d+) ", after)] == list(range(reached + 1, STEPS + 1))

@@ -26,7 +26,7 @@ def test_a_sound_state_has_no_fault():
 
 @pytest.mark.parametrize("name, value, complaint", [
     ("position", torch.nan, "not finite"), ("velocity", torch.inf, "not finite"), ("density", torch.nan, "not finite"),
-    ("velocity", 50.0, "faster than 20"), ("density", 2.0, "farther than 0.5")])
+    ("velocity", 50.0, "speed above the limit 20"), ("density", 2.0, "differs by more than 0.5")])
 def test_a_faulty_particle_is_described(name, value, complaint):
     particles = sound()
     getattr(particles, name)[4] = value

@@ -94,7 +94,7 @@ def test_inputs_and_outputs_of_terms():
 
 
 @pytest.mark.parametrize("changes, message", [
-    (dict(terms=("pressure", "pressure")), 'terms = ["pressure", "pressure"]: must be one or more terms, each once'),
+    (dict(terms=("pressure", "pressure")), 'terms = ["pressure", "pressure"]: must be one or more terms with'),
     (dict(terms=("presure",)), "did you mean pressure?"),
     (dict(terms=("pressure",), preset="wcsph"), "the list is given twice; remove one of the two"),
     (dict(terms=("pressure",), settings={"pairs": {}}), "[model.pairs]: no such term; the terms are pressure; remove"),
@@ -138,7 +138,7 @@ def test_an_own_term_has_keys_of_its_own(tmp_path, own):
 
 
 @pytest.mark.parametrize("body, message", [
-    ("class Bad(Term):\n    class Settings: pass\n", "its Settings must be a class of"),
+    ("class Bad(Term):\n    class Settings: pass\n", "its Settings must be a dataclass derived"),
     ("class Bad(Term):\n    class Settings(TermSettings):\n        a: float = 1\n", "write @dataclass(frozen=True)"),
     ("class Bad(Term):\n    @dataclass(frozen=True)\n    class Settings(TermSettings):\n        a: complex = 1j\n",
      "Bad.Settings.a: complex: a key is declared by number, integer"),
@@ -178,8 +178,8 @@ def test_a_density_that_no_term_reads_is_not_needed(tmp_path):
 
 @pytest.mark.parametrize("key, path, message", [
     ("flow.fluid", "eddies.scene.scene:load_scene",
-     '[flow] fluid = "eddies.scene.scene:load_scene": cannot be used here, it has no nonlinear, linear'),
-    ("initial.kind", "eddies.scene.scene:BUILT_IN", "cannot be used here, it has no __call__"),
+     '[flow] fluid = "eddies.scene.scene:load_scene": cannot be used here, because it has no nonlinear, linear'),
+    ("initial.kind", "eddies.scene.scene:BUILT_IN", "cannot be used here, because it has no __call__"),
     ("simulation.method", "eddies.scene.scene:Scene", "it has no advance, frame, status"),
     ("model.pairs.network", "eddies.scene.scene:Scene", "[model.pairs] network"),
 ])

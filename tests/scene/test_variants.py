@@ -70,8 +70,8 @@ BAD_OPTIONS = [
     (["a.b.c.d=1"], [], "--set a.b.c.d=1: must be section.key=value"),
     ([], ["variant.plain.seed"], "--unset: variant.plain.seed: there is no such key or section to remove"),
     (["variant.plain=3"], [], "--set: variant: must be sections; write [variant.NAME]"),
-    (["base=hit"], [], "--set base=hit: base is a key of a file alone; write a scene with this base"),
-    (['unset=["training"]'], [], "unset is a key of a file alone; use --unset"),
+    (["base=hit"], [], "--set base=hit: base can only be set in a file; write a scene with this base"),
+    (['unset=["training"]'], [], "unset can only be set in a file; use --unset"),
     (["variant.plain.name=x"], [], 'variant "plain": name: a variant cannot change this key'),
 ]
 
@@ -86,7 +86,7 @@ def test_bad_options(tmp_path, overrides, removals, message):
 BAD = [
     ('base = "tine"\n', "base: tine: no such scene; did you mean tiny?"),
     ("base = 3\n", "base = 3: must be the name or the path of a scene"),
-    ('base = "case.toml"\n', 'base = "case.toml": the scene is its own base'),
+    ('base = "case.toml"\n', 'base = "case.toml": this scene is its own base'),
     ('unset = ["forcing"]\n', "unset: there is no base to remove keys from"),
     (HEAD + 'unset = "forcing"\n', 'unset = "forcing": must be a list of keys or sections'),
     ('unset = ["forcng"]\n' + HEAD, "forcng: there is no such key or section to remove"),
@@ -102,7 +102,7 @@ BAD = [
     (HEAD + "[varaint.a]\n", "[varaint]: no such section; did you mean variant?"),
     ('bas = "tiny"\n', "bas: no such key; did you mean base?"),
     (HEAD + "realisations = [3, 1]\n", "realisations = [3, 1]: 1 is the seed of the scene"),
-    (HEAD + "realisations = [3, 3]\n", "realisations = [3, 3]: 3 is there more than once"),
+    (HEAD + "realisations = [3, 3]\n", "realisations = [3, 3]: 3 is given more than once"),
     ('base = "taylor-green"\n[variant.a]\n', 'variant "a": variants are compared by their rollouts; add [simulation]'),
     (HEAD + "[variant.a]\nrealisations = [3]\n", 'variant "a": realisations: a variant cannot change this key'),
 ]

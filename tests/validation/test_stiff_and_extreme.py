@@ -110,7 +110,7 @@ def test_explicit_stepper_is_unstable_where_the_exponential_one_is_not(comm):
 def test_a_run_that_diverges_says_so_at_the_step_and_names_the_limit(comm, tmp_path, limit):
     name, overrides = TOO_LONG[limit]
     scene = load_scene(name, ["flow.cells=8", "time.duration=4", *overrides])
-    with pytest.raises(FlowDiverged, match=f"Broken: {limit.split(',')[0]}, .* stable up to 2.[78]") as caught:
+    with pytest.raises(FlowDiverged, match=f"Exceeded limits: {limit.split(',')[0]}, .* stable up to 2.[78]") as caught:
         dns.run(scene, comm, tmp_path)
     assert isinstance(caught.value, UserError)
     fluid = build_fluid(scene.flow, scene.forcing, comm)

@@ -110,7 +110,7 @@ def test_steps_that_are_too_long_for_a_forced_rollout_or_for_a_term(comm, warned
 @pytest.mark.mpi(1)
 def test_terms_and_weights_that_nothing_trains(warned, tmp_path):
     lines = warned("model.preset=transport-velocity")
-    assert any('"transport-velocity" is trained through horizons alone' in line for line in lines)
+    assert any('"transport-velocity" learns only in the training through horizons' in line for line in lines)
     assert warned("model.preset=transport-velocity", "training.horizons.steps=5", "simulation.step=0.001") == []
     line, = warned(f"model.path={tmp_path}")
     assert f"there is no {tmp_path / 'model.h5'} yet" in line
@@ -265,7 +265,7 @@ def test_a_ground_truth_with_too_few_frames_or_without_motion(comm, tmp_path):
     scene = load_scene(TINY, ["tracers.field_every=5"])
     write_ground_truth(comm, tmp_path, frames=30)
     check_ground_truth(["train", "simulate"], scene, comm, tmp_path)
-    with pytest.raises(SceneError, match="after frame 14 of 30 no filtered field is followed"):
+    with pytest.raises(SceneError, match="from frame 14 of 30 on, no filtered field is followed"):
         coarse = dataclasses.replace(scene.simulation, frame_interval=0.5)
         check_ground_truth(["simulate"], dataclasses.replace(scene, simulation=coarse), comm, tmp_path)
     for group, value, stages, message in (("eddy_turnover_time", 1e12, ["simulate"], "3.8e.12 steps of 0.08"),

@@ -33,7 +33,7 @@ def test_another_model_of_the_same_settings_and_a_ground_truth_that_is_gone():
     sentence, = mixed_products({"model": {**MODEL, "id": "m2", "made_from": {}}, "rollout": ROLLOUT})
     assert "a ground_truth.h5 that is not here and from another model.h5" in sentence and "same settings" in sentence
     sentence, = mixed_products({"model": MODEL})
-    assert "a ground_truth.h5 that is not here" in sentence and "bring back what is missing" in sentence
+    assert "a ground_truth.h5 that is not here" in sentence and "restore the missing file" in sentence
 
 
 @pytest.mark.mpi(1)
@@ -43,7 +43,7 @@ def test_a_truth_of_another_run_that_has_changed_is_named(comm, tmp_path):
     known = product_provenance(path)["id"]
     for truths, number in (({path: known}, 0), ({path: "t9"}, 1), ({str(tmp_path / "gone.h5"): "t9"}, 0)):
         found = changed_truths({**MODEL, "truths": truths})
-        assert len(found) == number and all(f"was trained on another {path}" in each for each in found)
+        assert len(found) == number and all(f"was trained on a {path} that has since changed" in each for each in found)
 
 
 def warning_of(comm, directory, kind, **holes):

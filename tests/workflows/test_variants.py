@@ -125,7 +125,7 @@ def test_products_with_weights_of_a_file_are_not_shared_and_stages_of_one_varian
     (["run", "small.toml", "--variant", "no-forces"], "did you mean no-force?"),
     (["run", "unseen.toml", "--set", 'variant.learned.training.truths=["out/realisation-5"]', "--set",
       "simulation.start=0.5", "--set", "variant.grid.training.truths=none"],
-     "learned: is trained on out/realisation-5/ground_truth.h5")],
+     "learned: [training] truths names out/realisation-5/ground_truth.h5")],
     ids=["no such stage", "no ground truth", "no such variant", "trained on a realisation"])
 def test_what_cannot_be_run_is_refused_before_any_work(comm, folder, capfd, command, message):
     assert run_cli(*command, "--output", "out") == 2

@@ -51,7 +51,7 @@ def random_distance_density(distance: np.ndarray) -> np.ndarray:
 
 
 def count_variance(position: np.ndarray, length: float) -> float:
-    """Variance of the counts of particles (n, 3) in cells of side CELL mean spacings, over that of random points.
+    """Variance of the counts of particles (n, 3) in cells of side CELL mean spacings, divided by that of random points.
 
     Counts of random points are multinomial: their variance is the mean times 1 - 1/cells. So 0 is a lattice, 1 random
     within sqrt(2 / cells), and more than 1 clustered. NaN for fewer than two cells a side.

@@ -218,7 +218,7 @@ def near(position: np.ndarray, length: float, chosen: np.ndarray,
 
 def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], tolerance: float,
              followed: int) -> list[np.ndarray]:
-    """Rows (2, m) of the pairs at each distance, to a fraction `tolerance` of it, among particles (n, 3).
+    """Rows (2, m) of the pairs at each of the distances, within a relative `tolerance`, among particles (n, 3).
 
     The first particle of a pair is one of the first `followed` rows. Each pair appears once.
     """

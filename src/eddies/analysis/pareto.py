@@ -25,10 +25,11 @@ def pareto_front(cost: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 
 def verdict(model: Method, others: Sequence[Method], cost: str, measures: Mapping[str, str]) -> list[str]:
-    """Two sentences: the measures in which a method is worth its cost, and the other measures.
+    """Two texts: the measures in which a method is worth its cost, and the rivals in the other measures.
 
-    It is worth its cost if no other method that costs no more is as accurate. Errors that differ by less than the
-    larger spread over realisations are equal. A method without a number counts as beaten.
+    A rival is another method that costs no more and is as accurate. A method is worth its cost if it has no rival.
+    Errors that differ by less than the larger spread over realisations are equal. A method without a number is no
+    rival. Each measure names only the cheapest rival and the number of the others. The errors are in the table.
 
     Parameters
     ----------
@@ -36,56 +37,42 @@ def verdict(model: Method, others: Sequence[Method], cost: str, measures: Mappin
     """
     if not others:
         return ["No other method was run."]
-    worth, not_worth = [], []
+    name, worth, beaten, unknown = model["label"], [], [], []
     for key, words in measures.items():
+        short = words.partition(" (")[0]
         if None in (model[key], model[cost]):
-            not_worth.append(f"{words} (no number)")
+            unknown.append(short)
             continue
-        measured = [row for row in others if None not in (row[key], row[cost])]
-        rivals = [row for row in measured if row[cost] <= model[cost] and not _worse(row, model, key)]
-        beaten = sum(row not in measured or _worse(row, model, key) for row in others)
-        score = f"{words} ({model[key]:.3g}, {beaten} of {len(others)} others beaten; "
+        rivals = sorted((row for row in others if None not in (row[key], row[cost])
+                         and row[cost] <= model[cost] and not _worse(row, model, key)), key=lambda row: row[cost])
         if rivals:
-            named = ", ".join(_compared(row, model, key, cost) for row in rivals)
-            not_worth.append(f"{score}as accurate and no slower: {named})")
-        elif measured:
-            best = min(measured, key=lambda row: row[key])
-            worth.append(f"{score}the best of them: {_compared(best, model, key, cost)})")
+            beaten.append(f"{short}: {rivals[0]['label']}" + (f" and {len(rivals) - 1} more" if rivals[1:] else ""))
         else:
-            worth.append(f"{score}none of them has a number)")
-    name = model["label"]
-    return [f"{name} is worth its cost in {', '.join(worth)}: nothing that is as fast is as accurate." if worth else
-            f"{name} is worth its cost in no measure.",
-            f"It is not in {', '.join(not_worth)}." if not_worth else
-            "There is no measure in which another method is as accurate and no slower."]
+            worth.append(short)
+    found = [f"As accurate and no slower, the cheapest named: {'; '.join(beaten)}."] if beaten else []
+    found += [f"{name} has no number for {'; '.join(unknown)}."] if unknown else []
+    return [f"{name} is worth its cost in {'; '.join(worth)}." if worth else f"{name} is worth its cost in no measure.",
+            " ".join(found) or "No other method is as accurate and no slower in any measure."]
 
 
 def cheapest_grid(model: Method, grids: Sequence[Method], cost: str, times: Mapping[str, str]) -> str:
     """A sentence that names the cheapest grid whose velocity error is at most the model's at all `times`.
 
-    `times` are keys of the errors, with the times in words. Means over realisations are compared. "" if the model has
-    not all numbers.
+    `times` maps keys of errors to the times in words. Means over realisations are compared. The sentence is empty if
+    the model lacks a number.
     """
-    def errors(row: Method) -> str:
-        return ", ".join(f"{row[key]:.3g}" for key in times)
-
     if not times or None in [model[key] for key in (cost, *times)]:
         return ""
-    limit = f"keeps the velocity error after {' and '.join(times.values())} at or below that of {model['label']}"
+    limit = f"keeps the velocity error after {' and '.join(times.values())} at or below the error of {model['label']}"
     kept = [row for row in grids if None not in [row[key] for key in (cost, *times)]
             and all(row[key] <= model[key] for key in times)]
     if not kept:
-        return f"No grid {limit} ({errors(model)})."
+        return f"No grid {limit}."
     best = min(kept, key=lambda row: row[cost])
-    return (f"The cheapest grid that {limit} ({errors(model)}) is {best['label']} ({errors(best)}), at "
-            f"{best[cost] / model[cost]:.2g} of its cost.")
+    return f"The cheapest grid that {limit} is {best['label']}, at {best[cost] / model[cost]:.2g} of the cost."
 
 
 def _worse(row: Method, model: Method, key: str) -> bool:
     """Whether the error of a row is larger, by more than either spread."""
     spread = max(one.get(f"{key}_spread") or 0.0 for one in (row, model))
     return row[key] > model[key] + spread
-
-
-def _compared(row: Method, model: Method, key: str, cost: str) -> str:
-    return f"{row['label']}, {row[key]:.3g} in {row[cost] / model[cost]:.2g} of its time"

@@ -1,4 +1,4 @@
-"""A rollout and the true particles: frames of both, and measures that are taken of both in the same way."""
+"""A rollout and the true particles: frames of both, and quantities that are measured in the same way on both."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -61,7 +61,8 @@ class Pair:
 
 @dataclass(frozen=True)
 class Plane:
-    """Velocity (3, n, n) and magnitude of the vorticity (n, n), [y, x] in the plane z = pi, made of particles."""
+    """Velocity (3, n, n) and vorticity magnitude (n, n), [y, x], in the plane z = pi, reconstructed from particles.
+    """
 
     velocity: np.ndarray
     vorticity: np.ndarray
@@ -205,14 +206,14 @@ class Rollout:
         return np.flatnonzero(self._has_flow(self.common.times))
 
     def shown_spectra(self, several: bool = True) -> np.ndarray:
-        """A few of these frames, from the first to the last, or only the last."""
+        """A few frames of `spectral`, evenly spread, or only the last."""
         return _spread(self.spectral(), SHOWN) if several else self.spectral()[-1:]
 
     def late_spectra(self) -> np.ndarray:
         """Frames of the model over which its spectrum is averaged, in the second half before it broke.
 
-        They are at times at which the flow's spectrum is stored, or after the end of the truth; the last such frame
-        before the second half if it has none.
+        The flow's spectrum is stored at their times, or they are after the end of the truth. If the second half has no
+        such frame, the last such frame before it is used.
         """
         times = self.model.times
         chosen = self._has_flow(times) | ~_contained(times, self.truth.times)
@@ -220,7 +221,7 @@ class Rollout:
         return frames[second_half(times[frames], float(times[self.before_broken("model")[-1]]))]
 
     def spectra_at(self, index: int) -> SpectraAt:
-        """The spectra at a common frame, with the flow's at the nearest time; only the shells that all of them have."""
+        """Spectra at a common frame, in the shells that all of them have. That of the flow is at the nearest time."""
         common = self.common
         model, truth = self.both(self.spectra, index)
         nearest = int(np.argmin(np.abs(self.flow["time"] - (self.start_time + common.times[index]))))
@@ -233,7 +234,7 @@ class Rollout:
 
 
 def second_half(times: np.ndarray, end: float) -> np.ndarray:
-    """Rows of rising times within [end / 2, end]; without such a time, the last row before `end`."""
+    """Rows of the increasing `times` within [end / 2, end]; if there are none, the last row before `end`, or row 0."""
     rows = np.flatnonzero((times >= end / 2) & (times <= end * (1 + 1e-9)))
     return rows if rows.size else np.array([max(int(np.searchsorted(times, end, "right")) - 1, 0)])
 

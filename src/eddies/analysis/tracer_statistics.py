@@ -1,4 +1,4 @@
-"""Statistics of the tracers of a ground truth: energy, acceleration, memory and dispersion.
+"""Statistics of the tracers of a ground truth: energy, acceleration, Lagrangian structure function, pair dispersion.
 
 Tracers follow the filtered flow: its eddies set their accelerations and small-scale separations.
 """
@@ -35,7 +35,7 @@ class TracerStatistics:
 
     Parameters
     ----------
-    energy_ratio : <v.v> of the tracers over that of the filtered field, at `field_times`, (fields,).
+    energy_ratio : <v.v> of the tracers divided by <v.v> of the filtered field, at `field_times`, (fields,).
     energy_error : standard deviation of this ratio for as many random points, (fields,).
     probability : PDF (bins,) on EDGES of an acceleration component in units of its rms at the time, from differences of
         successive frames.

@@ -66,7 +66,7 @@ class InvariantBins:
         return np.histogram2d(*clipped, (self.second, self.third))[0] / second.size
 
     def coarser(self) -> "InvariantBins":
-        """The same ranges in at most 18 bins: conditional means need more particles per cell."""
+        """The same ranges in at most 18 bins per axis, because conditional means need more particles per cell."""
         edges = min(18, self.second.size - 1) + 1
         return InvariantBins(*(np.linspace(fine[0], fine[-1], edges) for fine in (self.second, self.third)))
 
@@ -76,7 +76,7 @@ class InvariantBins:
 
 
 class ConditionalVelocity:
-    """Mean (dQ/dt, dR/dt) of Lagrangian particles at given (Q, R): sums over bins.
+    """Conditional mean of (dQ/dt, dR/dt) of Lagrangian particles given (Q, R), from sums over bins.
 
     Rates are in units of <Q_w>^(3/2) and <Q_w>^2. Particles outside the bins are left out.
     """

@@ -23,7 +23,7 @@ LEAK = 0.5
 # density fluctuations the quadratic energy is several times the true one, or a fraction of it.
 GROWTH = 10
 
-EXACT = ', or take stepper = "etdrk4", which knows no such limit'
+EXACT = ', or take stepper = "etdrk4", which has no such limit'
 REMEDIES = {"advection": "lower courant or step", "sound": "lower courant or step" + EXACT,
             "viscosity": "lower max_step or step" + EXACT}
 
@@ -38,7 +38,7 @@ class FlowDiverged(UserError, RuntimeError):
     def unless_finite(cls, number: float, clock: Clock) -> None:
         """Raise FlowDiverged if a number measured in a flow is not finite."""
         if not math.isfinite(number):
-            raise cls("the flow is not finite", clock, "Correct what it starts from: amplitude or path"
+            raise cls("the flow is not finite", clock, "Correct the initial flow: amplitude or path"
                       if clock.steps == 0 else "Lower courant or step, or raise cells or viscosity")
 
 
@@ -74,7 +74,7 @@ def limits_of_step(k_max: float, step: float, speed: float, viscosity: float, ex
     i k_max (|u| + |v| + |w|) for advection, with i sqrt(3) k_max c added for sound. For viscosity they are
     -3 nu k_max^2, or -4 nu k_max^2 in a compressible fluid. RK4 is stable up to where its region meets the axes.
 
-    ETDRK4 takes viscosity and sound exactly. Without them its region is that of RK4. Viscosity widens it: it reaches
+    ETDRK4 treats viscosity and sound exactly. Without them its region is as for RK4. Viscosity widens it: it reaches
     3.2, 3.9 and 4.9 at nu k^2 step = 1, 3 and 5, and about 0.7 nu k^2 step beyond. Undamped sound makes it leak: waves
     with c k step between 1 and 7 grow. In a uniform flow they grow by up to 0.1, 2, 7 and 15 % a step at an advective
     number of 0.5, 1, 1.5 and 2. A damping 2/3 nu k^2 step of 0.0013, 0.024, 0.1 and 0.22 stops them. Turbulence, where
@@ -98,15 +98,15 @@ def advice(fluid: Fluid, limits: Sequence[StepLimit], kmax_eta: float, mach: flo
     """Return the remedy for an unstable run: for the broken limits, a supersonic flow (M_t > 1) or the resolution."""
     broken = [limit for limit in limits if limit.exceeded]
     if broken:
-        return "Broken: " + "; ".join(f"{limit}: {REMEDIES[limit.name]}" for limit in broken)
+        return "Exceeded limits: " + "; ".join(f"{limit}: {REMEDIES[limit.name]}" for limit in broken)
     if mach > 1:
         return (f"The flow is supersonic, its turbulent Mach number was {mach:.2g}, and shocks are not resolved: raise "
                 "sound_speed, or lower amplitude or injection_rate")
     resolution = f"k_max eta was {kmax_eta:.2g}, about 1 is needed" if fluid.viscosity > 0 else "there is no viscosity"
-    text = ("The step broke no limit (" + "; ".join(map(str, limits)) + f"), so the grid is likely too coarse "
+    text = ("The step exceeded no limit (" + "; ".join(map(str, limits)) + f"), so the grid is probably too coarse "
             f"({resolution}): raise cells or viscosity")
     if fluid.compressible and len(limits) == 1 and limits[0].number > LEAK:
-        text += ". Or sound grows because it is hardly damped: lower courant or step"
+        text += ". Or weakly damped sound waves grow: lower courant or step"
     return text
 
 

@@ -1,4 +1,4 @@
-"""Subgrid closures: the force of the scales that a coarse grid or a filter leaves out, on the resolved ones."""
+"""Subgrid closures: models of the force that scales removed by a coarse grid or a filter exert on the others."""
 
 from collections.abc import Callable
 
@@ -79,10 +79,11 @@ class DynamicStress(StressModel):
 
         l^2 = max(<(L - H):M> / <M:M>, 0),   L = (uu)^ - u^ u^,   M = 2 ((|S|S)^ - r |S^|S^).
 
-    ^ is a test filter. r is the squared ratio of widths, of both filters together to the first one. H is the gradient
-    part of both filters together minus that of the first, test-filtered. Without a filter width the first filter is
-    the grid, and ^ cuts off above half its highest wavenumber; all tensors then have only the modes below. With a
-    width d the first filter is Gaussian of width d, ^ is Gaussian of width 2 d, and r = 5.
+    ^ is a test filter. r is the squared ratio of two widths, of both filters combined and of the first filter. H is the
+    gradient part of both filters combined minus the test-filtered gradient part of the first filter. Without a filter
+    width the first filter is the grid, and ^ cuts off above half its highest wavenumber. All tensors then have only the
+    modes below this cutoff. With a width d the first filter is Gaussian of width d, ^ is Gaussian of width 2 d, and
+    r = 5.
     """
 
     def __init__(self, grid: SpectralGrid, filter_width: float, with_gradient: bool = False) -> None:

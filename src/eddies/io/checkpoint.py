@@ -91,8 +91,8 @@ class CheckpointDirectory:
     def write(self, step: int, state: Mapping[str, Any], files: Sequence[str] = ()) -> None:
         """Add a checkpoint, and keep the newest few. If it cannot be written, the earlier ones are intact.
 
-        `state` holds `Block`s of arrays, and arrays and values for JSON, of which those of rank 0 count: the ranks may
-        have measured different times. `files` names closed files in this directory that belong to the checkpoint.
+        `state` holds `Block`s of arrays, other arrays, and values for JSON. Arrays and values are taken from rank 0,
+        because the ranks may have measured different times. `files` names closed files here that belong to it.
         """
         path = self.path / f"step-{step:08d}.h5"
         arrays = {name: part for name, part in state.items() if isinstance(part, np.ndarray | Block)}
@@ -127,7 +127,7 @@ class CheckpointDirectory:
             paths.pop(0)
         newest = Checkpoint(paths[0]) if paths else None
         if newest is not None and self.comm.rank == 0 and newest.content["computed_by"] != _computed_by():
-            log.warning("the checkpoint was made with %s; now there are %s: the run continues, but not bit for bit",
+            log.warning("the checkpoint was made with %s, and this run has %s: it continues, but not bit for bit",
                         newest.content["computed_by"], _computed_by())
         kept = {path.name for path in paths}.union(() if newest is None else newest.files)
 
@@ -158,9 +158,9 @@ class CheckpointDirectory:
 
 
 class Guard:
-    """Write checkpoints when they are due, and stop the run on request. All methods are collective.
+    """Writer of the checkpoints that are due, which also stops the run on request. All methods are collective.
 
-    `of`, added to the message of a stop, says what the steps belong to.
+    `of` follows the step number in the message of a stop, such as " of the training".
     """
 
     def __init__(self, comm: MPI.Comm, directory: Path, fingerprint: str, stop: StopRequest | None,
@@ -222,7 +222,7 @@ def _write_array(file: h5py.File, name: str, block: Block) -> None:
     """Write a global array from the blocks of all ranks.
 
     Blocks that are cut along a later axis than the first are written one component at a time: MPI counts bytes in 32
-    bits, and a single writer holds in memory what is written at once.
+    bits, and a single writer holds each written part in memory.
     """
     values, axis = block.values, block.axis
     shape = (*values.shape[:axis], block.total, *values.shape[axis + 1:])

@@ -205,8 +205,8 @@ def _read_table(descriptor: int, first: int, last: int, size: int) -> np.ndarray
 
 
 def _read_sums(descriptor: int, first: int, part: memoryview, size: int, skipped: int = 0) -> np.ndarray:
-    """Fill `part` with the bytes of a file, of which `size` are covered, from `skipped` bytes after the beginning of
-    block `first` on. Returns the checksums of all blocks that the part touches."""
+    """Fill `part` with bytes of a file, starting `skipped` bytes after the beginning of block `first`. The checksums
+    cover the first `size` bytes of the file. Returns the checksums of all blocks that the part touches."""
     start, end = first * BLOCK_BYTES, first * BLOCK_BYTES + skipped + len(part)
     head, tail = bytearray(skipped), bytearray(min(_count_blocks(end) * BLOCK_BYTES, size) - end)
     os.preadv(descriptor, [head, part, tail], start)

@@ -135,7 +135,7 @@ def _dataset(arrays: Mapping[str, tuple[Any, Callable[[tuple], np.ndarray]]], at
 
 if xarray is not None:
     class LazyArray(BackendArray):
-        """An array of which xarray reads the parts that are used."""
+        """An array that xarray reads only in the parts that are used."""
 
         def __init__(self, array: h5py.Dataset | MadeArray, read: Callable[[tuple], np.ndarray]) -> None:
             self.shape, self.dtype, self._read = array.shape, array.dtype, read

@@ -61,8 +61,8 @@ class VelocityCubes:
             shape = (self.cells,) * 3 + ((3,) if len(state) == 1 else ())
             for dataset in state:
                 if dataset.shape != shape or dataset.dtype.kind != "f" or not self.cells:
-                    raise ProductError(f"{_place(dataset)}: is of type {dataset.dtype} and shape {dataset.shape}, no "
-                                       "velocity on a cube with equally many points along each axis; take such a cube")
+                    raise ProductError(f"{_place(dataset)}: has type {dataset.dtype} and shape {dataset.shape}; a "
+                                       "velocity with the same number of points along each axis is needed")
 
     def __len__(self) -> int:
         """Number of states."""
@@ -109,7 +109,7 @@ def _velocity_cubes(file: h5py.File) -> VelocityCubes:
         return _cutouts([cutouts[number] for number in sorted(cutouts)])
     if all(isinstance(file.get(f"state_phys/v{axis}"), h5py.Dataset) for axis in "xyz"):
         return _fluidsim_state(file)
-    raise ProductError(f"{file.filename}: holds no velocity in a layout that is known: of eddies (ground_truth.h5), of "
+    raise ProductError(f"{file.filename}: holds no velocity in a known layout: of eddies (ground_truth.h5), of "
                        "a JHTDB cutout (Velocity_0001, ...) or of fluidsim (state_phys/vx, vy, vz); it holds: "
                        f"{', '.join(file) or 'nothing'}")
 
@@ -120,12 +120,12 @@ def _cutouts(datasets: Sequence[h5py.Dataset]) -> VelocityCubes:
     for name in ("xcoor", "ycoor", "zcoor"):
         points = file.get(name)
         if not isinstance(points, h5py.Dataset) or points.shape != (cubes.cells,):
-            raise ProductError(f"{file.filename}: holds no {name} with the {cubes.cells} points of the velocity, which "
-                               "would tell whether it is a whole periodic cube; get the cutout with its coordinates")
+            raise ProductError(f"{file.filename}: holds no {name} with {cubes.cells} points, which would show "
+                               "that the cube is whole and periodic; get the cutout with its coordinates")
         where = points[()].astype(np.float64)
         if not np.abs(where - where[0] - step * np.arange(cubes.cells)).max() < PLACE_TOLERANCE * step:
             raise ProductError(f"{file.filename}: {name} goes from {where[0]:.6g} to {where[-1]:.6g} in {len(where)} "
-                               "points: no whole periodic cube of edge 2 pi with points at equal distances; get all "
+                               "points, which is not the whole periodic cube of edge 2 pi at equal distances; get all "
                                "points of the cube, or every second, fourth, ...")
     return cubes
 
@@ -139,8 +139,8 @@ def _fluidsim_state(file: h5py.File) -> VelocityCubes:
         raise ProductError(f"{file.filename}: {FLUIDSIM_PARAMETERS} has no numbers Lx, Ly, Lz, the edges of the box; "
                            "take a file as fluidsim writes it") from None
     if not edges[0] > 0 or not np.allclose(edges, edges[0], rtol=1e-9, atol=0):
-        raise ProductError(f"{file.filename}: the box has the edges {', '.join(f'{edge:g}' for edge in edges)}; take a "
-                           "cube")
+        raise ProductError(f"{file.filename}: the box has the edges {', '.join(f'{edge:g}' for edge in edges)}; a "
+                           "cube is needed")
     return cubes
 
 

@@ -29,9 +29,9 @@ Result = TypeVar("Result")
 
 
 def in_files(comm: MPI.Comm, path: Path, work: Callable[[], Result]) -> Result:
-    """Do work with the files at `path` on rank 0; all ranks get its result.
+    """Call `work`, which uses the files at `path`, on rank 0, and return its result on all ranks.
 
-    All ranks raise its UserError, or a WriteError if it raises OSError.
+    If `work` raises UserError, all ranks raise it. If it raises OSError, all ranks raise WriteError.
     """
     with file_errors(path):
         return on_first_rank(comm, work)

@@ -73,7 +73,7 @@ class Holder:
     def lives(self) -> bool | None:
         """Whether the job still runs; None if this machine cannot know.
 
-        The job's own machine knows. A Slurm job that was queued again knows that its earlier run has ended.
+        The machine on which the job runs can always know. A requeued Slurm job knows that its earlier run has ended.
         """
         own = self.this_job()
         if self.batch and self.batch == own.batch and self.restarts < own.restarts:
@@ -132,7 +132,7 @@ class RunLock:
         return self._lost
 
     def release(self) -> None:
-        """Remove the lock, unless it is that of another job."""
+        """Remove the lock, unless it belongs to another job."""
         self._ended.set()
         self._signs.join()
         if _is_held_by(self.path, self.holder):
@@ -189,8 +189,8 @@ def find_lock(directory: Path) -> FoundLock | None:
 def _refuse(directory: Path, found: FoundLock | None) -> None:
     if found is not None and not found.stale:
         raise RunInUse(f"{directory}: another job works here ({found.holder}; its last sign of life was "
-                       f"{duration(max(found.silent, 0))} ago); wait for its end, or end it by a file STOP there, or "
-                       "choose another --output; if it is dead, add --take-over")
+                       f"{duration(max(found.silent, 0))} ago); wait until it ends, end it by a file STOP there, or "
+                       "choose another --output; if the job has died, add --take-over")
 
 
 def _take(directory: Path, take_over: bool) -> RunLock:
@@ -230,7 +230,7 @@ def _write(path: Path, holder: Holder) -> None:
 
 
 def _now(directory: Path) -> float:
-    """The time by the clock that stamps files there, or by this machine's if no file can be written."""
+    """Present time by the clock of the directory's file system, or of this machine if no file can be written there."""
     try:
         with tempfile.TemporaryFile(dir=directory) as file:
             return os.fstat(file.fileno()).st_mtime

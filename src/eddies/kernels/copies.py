@@ -117,8 +117,8 @@ class PlaneCopies(_Copies):
 
     Blocks (c, planes, y, x), kx >= 0, are what ranks exchange; they follow each other in y. Two real planes f and g,
     half a block of planes apart, are transformed as one complex plane f + i g, whose packed modes (c, pairs, ky, kx)
-    hold kx = 0 ... K, -K ... -1. The number of planes is even, or one: a single plane is its own partner. By round-off
-    modes of kx = 0 and their mirror images may not be conjugate; their mean is taken.
+    hold kx = 0 ... K, -K ... -1. The number of planes is even, or one: a single plane is its own partner. Round-off may
+    make modes of kx = 0 and their mirror images not exactly conjugate, so their mean is taken.
     """
 
     exchanged_axis = 2

@@ -69,8 +69,8 @@ def load(instruction_set: str) -> ctypes.CDLL:
         built_from.restype = ctypes.c_char_p
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest().encode()
     if sources and (built_from is None or built_from() != digest):
-        raise MissingLibraryError(f"the compiled kernels in {sources[0].parent} were built from other sources than "
-                                  "lie beside them: build them again with `python setup.py build_ext --inplace`")
+        raise MissingLibraryError(f"the compiled kernels in {sources[0].parent} do not match the sources "
+                                  "beside them: build them again with `python setup.py build_ext --inplace`")
     return loaded
 
 

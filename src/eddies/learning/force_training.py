@@ -29,7 +29,7 @@ HISTOGRAM_BINS, HISTOGRAM_REACH = 41, 5.0
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of the other losses; that of the trajectory loss is 1. The power loss is not part of Eq. 15."""
+    """Weights of the other losses; the trajectory loss has weight 1. The power loss is not part of Eq. 15."""
 
     field: float = 0.0
     velocity_kl: float = 0.0
@@ -169,7 +169,7 @@ class ForceTrainer:
     ----------
     model, frames : the frames all on the same slabs.
     kernel : of the field loss; None without that loss. Its grid has about as many points as there are particles, or is
-        that of the filtered field.
+        the grid of the filtered field.
     weights : of the losses. batch : particles of a step without the field loss.
     """
 

@@ -17,7 +17,7 @@ from eddies.particles.smoothing_kernels import KernelNetwork
 
 @dataclass(frozen=True)
 class KernelLossWeights:
-    """Weights of Eq. 8; that of the velocity is 1."""
+    """Weights of Eq. 8; the velocity loss has weight 1."""
 
     gradient: float = 1.0
     normalization: float = 0.0

@@ -1,4 +1,4 @@
-"""Gradient descent on a global loss of which each rank differentiates its share."""
+"""Gradient descent on a global loss. Each rank differentiates its own share of the loss."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ def share_text(comm: MPI.Comm, text: str, root: int = 0) -> str:
 
 
 def first_complaint(comm: MPI.Comm, complaint: str | None) -> str | None:
-    """Return the complaint of the lowest rank that has one, on every rank; None if no rank has one."""
+    """Return on every rank the complaint of the lowest rank that has one; None if no rank has one."""
     rank = int(global_min(comm, comm.size if complaint is None else comm.rank))
     return None if rank == comm.size else share_text(comm, complaint or "", rank)
 

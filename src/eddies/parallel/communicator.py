@@ -32,8 +32,8 @@ def warn_of_few_processors(comm: Comm) -> None:
         together = within_quota(set().union(*node.allgather(processors())))
         own, number = max(min(within_quota(processors()), together // node.size), 1), threads()
     if comm.rank == 0 and 1 < number > own:
-        log.warning("OMP_NUM_THREADS = %d: each rank has %d of the processors here, so that its threads wait for one "
-                    "another; set it to %d, start fewer ranks, or bind each to %d processors (mpirun --map-by "
+        log.warning("OMP_NUM_THREADS = %d, but each rank has only %d processors here, so its threads slow each other "
+                    "down; set it to %d, start fewer ranks, or bind each rank to %d processors (mpirun --map-by "
                     "slot:PE=%d)", number, own, own, number, number)
 
 

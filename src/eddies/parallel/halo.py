@@ -82,7 +82,7 @@ class PlaneHalo:
         _require_planes(decomposition, max(below, above), "the interpolation")
 
     def forward(self, planes: np.ndarray) -> list[np.ndarray]:
-        """Return [(c, below, ...), planes, (c, above, ...)] around planes (c, z_local, ...)."""
+        """Return the ghost planes below (c, below, ...), `planes` (c, z_local, ...), and the ghost planes above."""
         slab, count = self.decomposition, planes.shape[1]
         lowest, highest = planes[:, : self.above], planes[:, count - self.below :]
         if slab.size == 1:

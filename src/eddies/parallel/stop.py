@@ -27,10 +27,10 @@ Loss = Callable[[], UserError | None]
 
 
 class Stopped(Exception):
-    """The job stops on request, all ranks at the same place. `goes_on` says where the next job continues."""
+    """The job stops on request, all ranks at the same place. `place` says where the next job continues."""
 
-    def __init__(self, reason: str, goes_on: str = "after the last finished stage") -> None:
-        super().__init__(f"stopped by {reason}; the same command goes on {goes_on}")
+    def __init__(self, reason: str, place: str = "after the last finished stage") -> None:
+        super().__init__(f"stopped by {reason}; the same command continues {place}")
 
 
 class StopRequest:

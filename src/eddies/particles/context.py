@@ -74,7 +74,7 @@ class Context:
     local : the particles that this rank sees; None if no term reads pairs.
     resolution : finds the resolved velocity; None if no term reads it.
     rows : (k,), the particles for which acceleration and density rate are computed; None: all.
-    dtype : type of the pair arithmetic; None: that of the positions.
+    dtype : type of the pair arithmetic; None: the type of the positions.
     density : (n,), the particles' density unless terms give it.
     time : of the evaluation within a run, for which earlier evaluations predict the modes; None: independent of them.
     """

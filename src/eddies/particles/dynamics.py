@@ -27,7 +27,7 @@ class ParticleDynamics:
     model : the terms. If no term reads pairs or the resolved velocity, there is no neighbour list and no halo, and
         particles do not change rank.
     skin : extra radius of list and halo. They are rebuilt when some particle has moved by half of it.
-    dtype : precision of pair arithmetic and of the resolved velocity; by default that of the positions. Positions stay
+    dtype : precision of pair arithmetic and of the resolved velocity; by default as the positions. Positions stay
         in double precision, and the conversion follows their subtraction.
     fixed_ranks : particles never change rank or row, as gradients through a few steps require. The halo widens by the
         distance that they leave their slab.

@@ -1,4 +1,4 @@
-"""Detection of a simulation that has gone wrong, and a description of the particle."""
+"""Detection of particles in a faulty state, and a description of the first one."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def find_fault(particles: ParticleSet, limits: Limits, box: PeriodicBox, step: i
 
     The description has step, rank, particle id, position, velocity, density and the nearest other particle of the rank.
     """
-    # Comparisons with NaN are false, hence a test for sound particles.
+    # Comparisons with NaN are false, so the test selects sound particles.
     sound = torch.linalg.vector_norm(particles.velocity, dim=1) <= limits.speed
     sound &= torch.isfinite(particles.position).all(1)
     if particles.density is not None:
@@ -38,9 +38,10 @@ def find_fault(particles: ParticleSet, limits: Limits, box: PeriodicBox, step: i
     if not all(bool(torch.isfinite(column[row]).all()) for column in particles.columns().values()):
         complaint = "not finite"
     elif float(torch.linalg.vector_norm(particles.velocity[row])) > limits.speed:
-        complaint = f"faster than {limits.speed:.6g}"
+        complaint = f"speed above the limit {limits.speed:.6g}"
     else:
-        complaint = f"density farther than {limits.density_deviation:.6g} from {limits.density_mean:.6g}"
+        complaint = (f"density differs by more than {limits.density_deviation:.6g} from the mean "
+                     f"{limits.density_mean:.6g}")
     return f"step {step}, rank {rank}, {_description(particles, box, row, complaint)}"
 
 

@@ -18,8 +18,8 @@ from eddies.particles.particle_set import ParticleSet
 def pair_features(dynamics: ParticleDynamics, particles: ParticleSet) -> Iterator[Tensor]:
     """Yield the inputs of a model's networks in blocks (features, m), one network after the other; collective.
 
-    Particles have the density that the model sees. Each rank yields at least one block. Each pair appears in both
-    orders, on the rank that owns its first particle, so counts are the same on any number of ranks.
+    The density of `particles` is the one that the model sees. Each rank yields at least one block. Each pair appears in
+    both orders, on the rank that owns its first particle. Therefore counts do not depend on the number of ranks.
     """
     terms = dynamics.model.networks
     context = dynamics.context(particles, density=particles.density)
@@ -31,7 +31,7 @@ def pair_features(dynamics: ParticleDynamics, particles: ParticleSet) -> Iterato
 class FeatureRange:
     """Smallest and largest value of each input of a network over all pairs of its training, (features,) each.
 
-    Outside of them the network extrapolates, smoothly but without a comparison with the truth.
+    Outside this range the network extrapolates: its values are smooth but were never compared with the truth.
     """
 
     low: np.ndarray

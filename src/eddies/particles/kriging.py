@@ -19,7 +19,7 @@ OWN, FIRST, SECOND, UP_TO_FIRST = 0, slice(1, 4), slice(4, 10), slice(0, 4)
 # Rows of the entries (j, k) of a symmetric matrix.
 PLACES = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 
-# Variance of the noise over that of the field. The smallest distances among random particles require as much.
+# Ratio of the noise variance to the field variance. The smallest distances among random particles require as much.
 NOISE = 1e-3
 # Squared lengths of the Gaussians in the covariance: the narrowest, in units of what a Gaussian filter makes of white
 # noise, and the number of lengths. Each is twice the one before.
@@ -114,7 +114,8 @@ class Kriging:
 
     @cached_property
     def laplacian_bound(self) -> Tensor:
-        """Sum of the magnitudes of the Laplacian's weights, (n,); 1/d^2 for a particle without neighbours."""
+        """Sum of the magnitudes of the Laplacian's weights, (n,); at least 1/d^2, as for a particle without neighbours.
+        """
         own, others = self._laplacian
         sizes = own.abs() + torch.segment_reduce(others.abs(), "sum", offsets=self._offsets)
         return sizes.clamp_min(self._filter_width**-2)

@@ -35,15 +35,15 @@ class Solution:
 
 
 class LeastSquares:
-    """The equations  A u = P B^T v,  A = P B^T B + penalty,  for the minimum of
+    """The normal equations  A u = P B^T v,  A = P B^T B + penalty,  whose solution minimises
 
         sum_i |v_i - u(x_i)|^2 + sum_k penalty_k |u(k)|^2
 
-    over solenoidal modes u (3, kz, ky, kx). B evaluates modes at points; P projects on the solenoidal modes `inside`.
+    over solenoidal modes u (3, kz, ky, kx). B evaluates modes at points; P projects onto solenoidal modes `inside`.
 
     Parameters
     ----------
-    inside : (kz, ky, kx), the modes to be found. penalty : (kz, ky, kx), real, 0 outside.
+    inside : (kz, ky, kx), the modes to solve for. penalty : (kz, ky, kx), real, 0 for all other modes.
     """
 
     def __init__(self, grid: FourierGrid, inside: Tensor, penalty: Tensor) -> None:

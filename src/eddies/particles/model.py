@@ -53,7 +53,7 @@ class LagrangianModel(nn.Module):
         self.flow = flow
         for name, term in self.terms.items():
             if "density" in term.settings.reads and "density" in term.settings.gives:
-                raise TermError(f'term "{name}": reads the density and gives a part of it; it can do only one of both')
+                raise TermError(f'term "{name}": both reads and gives the density; it can do only one of the two')
 
     def forced(self, settings: TermSettings | None) -> LagrangianModel:
         """Model of the same terms (not copies) and the known forcing of a flow, if it has one."""
@@ -158,8 +158,8 @@ class LagrangianModel(nn.Module):
             wrong = [rate for rate in STORED if getattr(direct, rate) is not None and not (
                 (getattr(expected, rate) - getattr(direct, rate)).norm() <= 1e-3 * getattr(direct, rate).norm())]
             if any_rank(context.comm, bool(wrong)):
-                raise TermError(f'term "{name}": declares itself linear in its parameters, and is not; remove its '
-                                "linear = True")
+                raise TermError(f'term "{name}": declares linear = True, but is not linear in its parameters; remove '
+                                "that line")
 
     @property
     def _stages(self) -> list[list[tuple[str, Term]]]:

@@ -69,9 +69,9 @@ class NeighborList:
         Parameters
         ----------
         receivers, senders : (n, 3) and (s, 3), the present positions of the rows that the list was built from.
-        rows : receivers to keep, as row numbers (k,) or a slice. Output row k belongs to the k-th of them.
-        dtype : type of displacement and distance; by default that of the positions. The conversion follows the
-            subtraction, so single precision loses no accuracy to the size of the box.
+        rows : receivers to keep, as row numbers (k,) or a slice. Output row i belongs to the i-th of them.
+        dtype : type of displacement and distance; by default the type of the positions. Positions are
+            subtracted before the conversion, so the size of the box costs no accuracy in single precision.
         """
         dtype, total = dtype or receivers.dtype, len(self.offsets) - 1
         if rows is None or isinstance(rows, slice):

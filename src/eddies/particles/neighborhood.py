@@ -91,7 +91,7 @@ class Neighborhood:
         return self._built_at if particles.id is self._ids else None
 
     def outdated(self, particles: ParticleSet) -> bool:
-        """Whether, on any rank, the particles are others or one has moved by more than half the skin or to NaN."""
+        """Whether, on any rank, the particles are new ones, or one has moved by more than half the skin or to NaN."""
         distance = math.inf
         if particles.id is self._ids:
             moved = self.box.displacement(particles.position.detach(), self._built_at)

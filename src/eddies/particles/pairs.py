@@ -145,8 +145,8 @@ class ScaledPairs:
     def invariants(self, names: Sequence[str], symmetric: bool) -> Tensor:
         """Inputs of a network for each pair, (features, m), in the order of INPUTS of the settings.
 
-        "density" gives two features: rho'_i and rho'_j, or, if `symmetric`, rho'_i + rho'_j and (rho'_i - rho'_j)^2,
-        which are equal for (i, j) and (j, i) as all others are.
+        "density" gives two features: rho'_i and rho'_j, or, if `symmetric`, rho'_i + rho'_j and (rho'_i - rho'_j)^2.
+        The symmetric features are equal for (i, j) and (j, i). All other features are always symmetric.
         """
         features: list[Tensor] = []
         if "density" in names:

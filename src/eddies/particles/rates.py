@@ -43,7 +43,7 @@ class Rates:
         return self.acceleration if self.shift_acceleration is None else self.acceleration + self.shift_acceleration
 
     def at(self, rows: Tensor | None) -> Rates:
-        """The same for some rows (k,) of the particles; the density stays that of all."""
+        """The rates of some rows (k,) of the particles. The density is still given for all particles."""
         if rows is None:
             return self
         kept = {name: getattr(self, name)[rows] for name in BY_PARTICLE if getattr(self, name) is not None}

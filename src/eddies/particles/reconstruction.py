@@ -34,7 +34,7 @@ def reconstruct_with_gradient(kernel: SmoothingKernel, pairs: Pairs, sender_volu
                               sender_values: Tensor) -> tuple[Tensor, Tensor]:
     """Result of `reconstruct` and its gradient (count, components, 3), the last axis the direction of the derivative.
 
-    The gradient sum_j V_j (A_j - <A>) grad W(x - x_j) / sum_j V_j W is exactly that of the average.
+    The gradient sum_j V_j (A_j - <A>) grad W(x - x_j) / sum_j V_j W is exactly the gradient of the average.
     """
     volume, value, distance = pairs.at_senders(sender_volumes), pairs.at_senders(sender_values).T, pairs.distance
     average, factor = _average(kernel, pairs, volume, value)

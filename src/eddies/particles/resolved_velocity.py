@@ -198,8 +198,8 @@ class ResolvedVelocity:
         """
         reach = self.grid.reach
         if farthest_outside(self.grid.decomposition, particles) >= reach:
-            raise HaloError(f"a particle is farther than {reach:.3g} outside its slab before it can change rank, "
-                            "beyond the ghost planes: shorten the time step or the skin")
+            raise HaloError(f"a particle is more than {reach:.3g} outside its slab, beyond the ghost planes, "
+                            "before it can change rank: shorten the time step or the skin")
         comm = self.grid.decomposition.comm
         mean = mean_over_ranks(comm, particles.velocity)
         relative, points = particles.velocity - mean, self.grid.points(particles.position)

@@ -92,7 +92,7 @@ def section(run: Rollout, span: StationarySpan) -> Section:
 
 
 def _transfer(run: Rollout, span: StationarySpan) -> np.ndarray:
-    """Return the energy that the filter keeps, by shell."""
+    """Return the fraction of the energy of each shell that the filter keeps."""
     return gaussian_transfer(np.arange(span.spectra.shape[1]) ** 2, run.filter_width) ** 2
 
 

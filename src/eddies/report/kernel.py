@@ -15,7 +15,7 @@ KERNELS = {  # name in the files: label, colour, line style
     "cubic_spline": ("cubic spline", DNS, "-."),
     "wendland": ("Wendland C$^2$", SECOND, ":"),
 }
-ERRORS = {  # what is compared, by name in the files: start of the key in the report, name in words
+ERRORS = {  # name of a compared kernel or form in the files: start of the key in the report, name in words
     "learned": ("", "learned kernel"),
     "learned_no_gradient": ("no_gradient_", "learned without L_g"),
     "cubic_spline": ("cubic_spline_", "cubic spline"),

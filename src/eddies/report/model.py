@@ -41,7 +41,7 @@ def section(description: Mapping[str, Any], table: Table, acceleration: Table, d
             history: Table | None, source: str | None = None, others: Sequence[str] = ()) -> Section:
     """Return the section with the errors at the last frame, from the tables of the product.
 
-    source: path of the run that the weights come from, if it is another one; the history is that of this run.
+    source: path of the run that the weights come from, if it is another one; it has made the history too.
     history: None if nothing was trained. others: the ground truths that the model was trained on, if they do not
     include the one of this flow, or of the source.
     """

@@ -21,7 +21,7 @@ class Metric:
     """One number of the report.
 
     key: its name in metrics.json. label: its name on the page. value: a number that is not finite becomes None.
-    reason: why there is no value. written: the text of the value on the page, if it is not that of `shown`.
+    reason: why there is no value. written: the text of the value on the page, if it differs from `shown(value)`.
     """
 
     key: str

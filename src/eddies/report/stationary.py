@@ -44,7 +44,10 @@ def stationary_state(statistics: Mapping[str, np.ndarray], span: StationarySpan)
 
 
 def draw_compensated(axis: Axes, spans: Mapping[str | None, tuple[StationarySpan, str]]) -> None:
-    """Draw compensated mean spectra of spans, given with a colour by label, and a band for Kolmogorov's constant."""
+    """Draw the compensated mean spectrum of each span, and a band for Kolmogorov's constant.
+
+    spans: span and colour by label.
+    """
     for label, (span, colour) in spans.items():
         k_eta, compensated = span.compensated_spectrum()
         axis.loglog(k_eta, compensated, color=colour, marker="o", markersize=3, label=label)

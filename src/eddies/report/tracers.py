@@ -17,7 +17,7 @@ TOO_FEW = "too few frames, or too few pairs of tracers"
 
 
 def section(found: TracerStatistics, scales: Mapping[str, float], power: float) -> Section:
-    """Return the section; `scales` are those of the flow at the release, `power` is that of its forcing per mass."""
+    """Return the section. `scales` are of the flow at the release; `power` is the forcing power per mass."""
     kurtosis, (first, last) = found.kurtosis, found.energy_ratio[[0, -1]]
     metrics = [
         Metric("tracer_energy_ratio_first", "⟨v·v⟩ of tracers / filtered field, at the release", float(first)),

@@ -42,7 +42,7 @@ CAPTION = ("In the table, spectrum errors, energies and KL divergences (nats) ar
 class ErrorAgainstTime:
     """A row of numbers by key for each variant, and the name of the variant (`subject`) that others are compared with.
 
-    A missing number is None.
+    A number that is missing is None.
     """
 
     rows: Sequence[Row]
@@ -203,7 +203,7 @@ def name_points(axis: Axes, points: np.ndarray, names: Sequence[str], bold: Sequ
         for height, (side, alignment) in product(heights, ((1, "left"), (-1, "right"))):
             text.set(position=(side * (8 + abs(height) / 4), height), horizontalalignment=alignment)
             text.update_positions(renderer)
-            box = Text.get_window_extent(text)  # that of the annotation includes the line
+            box = Text.get_window_extent(text)  # without the line, which the annotation's own extent includes
             inside = frame.x0 <= box.x0 and box.x1 <= frame.x1 and frame.y0 <= box.y0 and box.y1 <= frame.y1
             if inside and not any(box.overlaps(other) for other in taken):
                 break

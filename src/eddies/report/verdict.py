@@ -57,7 +57,7 @@ class Judged:
 
     @property
     def metric(self) -> Metric:
-        """A row of the table."""
+        """The row of this number in the table."""
         return Metric(self.key, self.words, {
             "this run": self.value, "verdict": self.mark, "beside it": self.beside,
             "good": self.within.format(self.good), "fair": self.within.format(self.fair)})

@@ -43,7 +43,7 @@ def check_names(name: str, seed: int, realisations: Sequence[int], has_rollouts:
         yield "realisations", "the scene has no [simulation] to make rollouts on them; add it, or remove the key"
     for other in realisations:
         if realisations.count(other) > 1:
-            yield "realisations", f"{other} is there more than once; name each seed once"
+            yield "realisations", f"{other} is given more than once; name each seed once"
         if other == seed:
             yield "realisations", (f"{other} is the seed of the scene, whose ground truth models are trained on; leave "
                                    "it out")
@@ -73,7 +73,7 @@ def check_foreign(flow: Flow, initial: Initial, simulation: Simulation | None, m
                 continue
             lacking = [name for name in REQUIRED.get(key, ()) if not hasattr(found, name)]
             if lacking:
-                yield f"{section}.{key}", f"cannot be used here, it has no {', '.join(lacking)}"
+                yield f"{section}.{key}", f"cannot be used here, because it has no {', '.join(lacking)}; add it"
             elif key == "network" and not (isinstance(found, type) and issubclass(found, load("torch.nn:Module"))):
                 yield f"{section}.{key}", "must be a class derived from torch.nn.Module"
 
@@ -89,8 +89,8 @@ def check_flow(flow: Flow, initial: Initial, forcing: Forcing | None, model: Mod
     if initial.flow.sound and not flow.compressible:
         yield "initial.kind", 'needs sound; set [flow] fluid = "compressible"'
     if model and initial.flow.steady and flow.viscosity == 0 and forcing is None:
-        yield "initial.kind", ("without viscosity nothing in it is accelerated, and a model is made dimensionless by "
-                               "the acceleration; choose another kind, or raise [flow] viscosity")
+        yield "initial.kind", ("without viscosity this flow has no acceleration, which models are made dimensionless "
+                               "with; choose another kind, or raise [flow] viscosity")
     for key in InitialFlow().keys:
         if key not in initial.flow.keys and getattr(initial, key) != type(initial).__dataclass_fields__[key].default:
             kinds = [kind for kind, each in INITIAL_FLOWS.items() if key in each.keys]
@@ -116,19 +116,19 @@ def check_time(time: Time, flow: Flow, forcing: Forcing | None, spin_up: SpinUp 
             yield "spin_up.stationary", ("only a flow with forcing and viscosity becomes stationary; add [forcing] "
                                          "with an injection_rate above 0 and a viscosity, or remove the key")
         if spin_up.stationary >= spin_up.turnovers:
-            yield "spin_up.stationary", (f"must be less than turnovers = {spin_up.turnovers:g}, of which they are the "
-                                         "last")
+            yield "spin_up.stationary", (f"must be less than turnovers = {spin_up.turnovers:g}, because the stationary "
+                                         "span is the last part of the spin-up; lower it")
     if forcing and tracers and not tracers.forced and spin_up is None:
         yield "forcing", ("acts only before the tracers start, and there is no [spin_up]; add [spin_up] turnovers, set "
                           "[tracers] forced = true, or remove [forcing]")
     if tracers and tracers.forced and forcing is None:
-        yield "tracers.forced", "there is no [forcing] that could stay on; add it, or remove the key"
+        yield "tracers.forced", "needs a section [forcing], which the scene lacks; add it, or remove the key"
 
 
 def check_tracers(tracers: Tracers, flow: Flow, initial: Initial) -> Problems:
     """A flow at rest, and stored fields finer than the flow."""
     if initial.flow.sound:
-        yield "initial.kind", ("starts from rest, and [tracers] are followed for turnovers of a flow that moves; "
+        yield "initial.kind", ("starts from rest and has no turnover time, in which [tracers] turnovers are counted; "
                                "choose another kind, or remove [tracers]")
     if tracers.cells > flow.cells:
         default = "" if tracers.field_cells else f"is {tracers.cells} (from particles_per_side) and "
@@ -172,7 +172,7 @@ def check_density(flow: Flow, model: Model | None, simulation: Simulation | None
         leave = (f'leave "density" out of [model.{name}] inputs' if "density" in getattr(one, "inputs", ()) else
                  f'remove "{name}"')
         if "density" in one.reads and "density" in one.gives:
-            yield "model.terms", f'"{name}" reads the density and gives a part of it; it can do one of both'
+            yield "model.terms", f'"{name}" both reads and gives the density; it can do only one of the two'
         if "density" not in reads and rates >= {*one.gives}:
             yield "model.terms", (f'"{name}" gives the density alone, which no term reads; remove it, or add a term '
                                   "that does")
@@ -185,14 +185,15 @@ def check_density(flow: Flow, model: Model | None, simulation: Simulation | None
             yield "model.terms", (f'"{name}" gives a rate of density, which an incompressible flow does not have; '
                                   f"remove it, {remedy}")
     if simulation and "density" in simulation.needs and incompressible:
-        yield "simulation.method", ("starts from the density, which an incompressible flow does not have; choose "
+        yield "simulation.method", ("needs the density, which an incompressible flow does not have; choose "
                                     f"another, {remedy}")
 
 
 def check_training(training: Training, tracers: Tracers | None, kernel: Kernel | None) -> Problems:
     """Steps, rates and weights that contradict each other."""
     if training.combined_steps > training.steps:
-        yield "training.combined_steps", f"must be at most steps = {training.steps}, of which they are the last"
+        yield "training.combined_steps", (f"must be at most steps = {training.steps}, because these are the last of "
+                                          "the steps; lower it")
     for section, part in {"": training, "[training.horizons] ": training.horizons}.items():
         if part is not None and training.final_learning_rate > part.learning_rate:
             yield "training.final_learning_rate", f"must be at most {section}learning_rate = {part.learning_rate:g}"
@@ -202,38 +203,40 @@ def check_training(training: Training, tracers: Tracers | None, kernel: Kernel |
                                               "multiple of it; change either")
     truths = training.truths
     if truths == ():
-        yield "training.truths", "must name one or more run directories; name them, or remove the key"
+        yield "training.truths", "is empty; name one or more run directories, or remove the key"
     if truths and training.frames < 2 * len(truths):
         yield "training.frames", f"the {len(truths)} truths need 2 each, {2 * len(truths)} in all; raise it"
     if tracers and training.batch > tracers.particles:
         yield "training.batch", (f"must be at most the number of particles, {tracers.particles}; lower it or raise "
                                  "[tracers] particles_per_side")
     if training.field_weight > 0 and kernel is None:
-        yield "training.field_weight", "this loss is an average with the kernel; add [kernel], or remove the key"
+        yield "training.field_weight", "this loss needs a section [kernel], which is missing; add it, or remove the key"
     if training.field_target == "flow" and training.field_weight == 0:
-        yield "training.field_target", "is of the field loss, which has no weight; set field_weight, or remove the key"
+        yield "training.field_target", "applies to the field loss, whose weight is 0; set field_weight, or remove it"
     later = training.field_weight + training.velocity_kl_weight + training.acceleration_kl_weight
     if (later > 0) != (training.combined_steps > 0):
         yield "training.combined_steps", (
-            "they are the steps that use field_weight, velocity_kl_weight and acceleration_kl_weight; give both the "
-            "steps and a weight above 0, or neither")
+            "only these steps use field_weight, velocity_kl_weight and acceleration_kl_weight; set both the steps and "
+            "a weight above 0, or neither")
 
 
 def check_simulation(simulation: Simulation, tracers: Tracers, seen: float) -> Problems:
-    """Frames between steps or between those of the ground truth, and a missing start. Training has seen the fraction
-    `seen` of the ground truth."""
+    """Frames at times without a step or without a frame of the ground truth, and a missing start.
+
+    `seen` is the fraction of the ground truth that training has used.
+    """
     step, frame_interval = simulation.longest_step, simulation.frame_interval
     if not (simulation.scheme.dense or math.isinf(step) or _is_multiple(frame_interval, step)):
         yield "simulation.frame_interval", (
             f'must be a whole multiple of step = {step:g} with integrator = "{simulation.integrator}", which gives no '
-            "values between steps; change any")
+            "values between steps; change one of the three")
     if not _is_multiple(frame_interval, tracers.frame_interval):
         yield "simulation.frame_interval", (
             f"must be a whole multiple of [tracers] frame_interval = {tracers.frame_interval:g}, so that truth and "
             "model are stored at the same times")
     if simulation.start is None and seen == 1:
-        yield "simulation.start", ("this key is missing; the training window is the whole ground truth, so there is "
-                                   "nothing after it; give start, or a smaller [training] window")
+        yield "simulation.start", ("this key is missing; the training window is the whole ground truth, so the rollout "
+                                   "cannot start after it; give start, or a smaller [training] window")
 
 
 def check_coarse_grid(eulerian: Eulerian | None, cells: int, flow: Flow, model: Model | None) -> Problems:

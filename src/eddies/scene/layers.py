@@ -117,7 +117,7 @@ def read_document(name_or_path: str, above: Sequence[Path] = ()) -> tuple[Path, 
         if not isinstance(base, str):
             raise SceneError(f"base = {shortened(quoted(base))}: must be the name or the path of a scene", "base")
         if path.resolve() in [other.resolve() for other in above]:
-            raise SceneError(f'base = "{base}": the scene is its own base; remove one of the keys', "base")
+            raise SceneError(f'base = "{base}": this scene is its own base; remove one of the base keys', "base")
         try:
             below = read_document(base, [*above, path])[1]
         except SceneError as error:
@@ -156,7 +156,7 @@ def _parse(path: Path) -> Document:
         # Some editors begin a file with a mark of its encoding.
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except RecursionError:
-        raise SceneError("not TOML of a scene: its brackets are nested too deep; no value has more than two") from None
+        raise SceneError("is no scene: its brackets are nested too deep; values have at most two levels") from None
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise SceneError(f"cannot be read: {reason}; give the path of a scene, a TOML file") from None
@@ -179,7 +179,7 @@ def command_line(overrides: Sequence[str], removals: Sequence[str]) -> Layer:
                              "or section.name.key=value in a section of a section; for one variant, "
                              "variant.NAME.section.key=value")
         if key in OF_FILES:
-            raise SceneError(f"--set {shortened(override)}: {key} is a key of a file alone; "
+            raise SceneError(f"--set {shortened(override)}: {key} can only be set in a file; "
                              + ("use --unset" if key == "unset" else "write a scene with this base"))
         values[key] = _parsed(value)
     return Layer(values, removals)

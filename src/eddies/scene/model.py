@@ -52,8 +52,8 @@ class Model(Section):
         terms = self.terms if self.terms is not None else tuple(preset)
         named = {short_name(term): term for term in terms}
         if len(named) < len(terms) or not terms:
-            raise self.problem("terms", "must be one or more terms, each once by its name, in an import path the part "
-                               "after the colon")
+            raise self.problem("terms", "must be one or more terms with different names; the name of an import path is "
+                               "the part after the colon")
         for name in self.settings:
             if name not in named:
                 raise SceneError(f"[model.{name}]: no such term; {nearest(name, named)}the terms are "
@@ -113,7 +113,7 @@ def replace_terms(table: dict[str, Any], keys: set[str]) -> None:
 
 
 def settings_class(term: str) -> type[TermSettings]:
-    """Return the class of a term's settings: that of a built-in term, or `Settings` of a user's class.
+    """Return the class of a term's settings: a class of this package, or `Settings` of a user's class.
 
     Raises ImportPathError for a wrong import path, SceneError for a class that is no term or has unfit Settings.
     """
@@ -125,8 +125,8 @@ def settings_class(term: str) -> type[TermSettings]:
     settings = getattr(kind, "Settings", TermSettings)
     if not (isinstance(settings, type) and issubclass(settings, TermSettings)
             and "__dataclass_fields__" in vars(settings)):
-        raise SceneError(f'"{term}": its Settings must be a class of their own kind: write @dataclass(frozen=True) and '
-                         "below it class Settings(eddies.TermSettings)")
+        raise SceneError(f'"{term}": its Settings must be a dataclass derived from eddies.TermSettings; write '
+                         "@dataclass(frozen=True) and below it class Settings(eddies.TermSettings)")
     return settings
 
 

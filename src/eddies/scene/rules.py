@@ -115,7 +115,7 @@ class Rule:
                 raise ValueError(f"whole numbers of a scene are at most {MOST:,}")
             return int(value)
         if value != 0 and not SMALLEST <= abs(value) <= LARGEST:
-            raise ValueError(f"numbers of a scene that are not 0 lie between {SMALLEST:g} and {LARGEST:g} in size")
+            raise ValueError(f"the magnitude of a number is 0, or between {SMALLEST:g} and {LARGEST:g}")
         return float(value)
 
 

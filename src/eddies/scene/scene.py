@@ -1,6 +1,6 @@
-"""A scene: the description of a flow and of what is to be learned from it, as read from one TOML file.
+"""A scene: the description of a flow, and of the models to learn from it, as read from one TOML file.
 
-An optional section that is absent is None, and then nothing is built for it. Variants of a scene are scenes that
+An optional section that is absent is None. Variants of a scene are scenes that
 differ from it in some keys.
 """
 
@@ -99,7 +99,7 @@ class Scene(Section):
         return tuple(stage for stage in STAGES if stage in asked)
 
     def inputs(self, stage: str) -> tuple[Stage, ...]:
-        """The stages of the scene from whose products a stage makes its own."""
+        """The stages of the scene whose products a stage reads."""
         return tuple(STAGES[name] for name in STAGES[stage].depends_on if name in self.stages)
 
     @property
@@ -115,7 +115,7 @@ class Scene(Section):
 
     @property
     def directory(self) -> Path:
-        """The run directory, unless another is given."""
+        """The default run directory, runs/NAME."""
         return Path("runs") / self.name
 
     @property
@@ -126,7 +126,7 @@ class Scene(Section):
 
     @property
     def window(self) -> float:
-        """Fraction of the ground truth for training; of a kernel alone the default of [training]."""
+        """Fraction of the ground truth that training may use. Without [training] it is the default of that section."""
         return self.training.window if self.training else DEFAULT_WINDOW
 
     def seen_in(self, directory: Path) -> float:
@@ -235,7 +235,7 @@ class Scene(Section):
                     yield f"{place(last, within)} = {quoted(ours)} where the scene has {quoted(theirs)}: {reason}"
 
     def _given(self, key: str) -> str:
-        """Return a key and its value as an error begins: "[flow] cells = 8"; without the value where there is none."""
+        """Return the beginning of an error, a key with its value if it has one, such as "[flow] cells = 8"."""
         within, _, name = key.rpartition(".")
         value: Any = self
         for part in key.split("."):
@@ -281,7 +281,7 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = (), removals
     Modules of the user's classes are searched in Python's own folders, then beside the file, then in the working
     directory.
 
-    Raises SceneError, with the file (or --set, --unset), the section, the key, what is allowed, and a remedy.
+    Raises SceneError, with the file (or --set, --unset), the section, the key, the allowed values, and a remedy.
     """
     path, document = read_document(str(name_or_path))
     search_in(path.parent)

@@ -349,8 +349,8 @@ class Simulation(Section):
             raise self.problem("step_from", f'step = {self.step:g} needs no other run; set step = "{CONVERGED}", or '
                                "remove step_from")
         if self.confirmed_on and not self.finds_step:
-            raise self.problem("confirmed_on", f'this rollout finds no step; set step = "{CONVERGED}" without '
-                               "step_from, or remove confirmed_on")
+            raise self.problem("confirmed_on", f'only a search for the step uses this key; set step = "{CONVERGED}" '
+                               "without step_from, or remove confirmed_on")
 
     @property
     def scheme(self) -> Scheme:
@@ -458,7 +458,7 @@ class Eulerian(Section):
         return self.fluid == "compressible"
 
     def filter_passed(self, filter_width: float) -> float:
-        """Width of the filter on the velocity of the equations: that of the particles, or 0."""
+        """Width of the filter that the velocity of the equations has passed: the particles' filter width, or 0."""
         return filter_width if self.equations == "filtered" else 0.0
 
     def cells_for(self, filter_width: float) -> int:

@@ -75,7 +75,7 @@ class TermSettings(Section):
 
     @classmethod
     def section_name(cls) -> str:
-        """The name of the class; only the scene knows that of the section."""
+        """The name of the class, because only the scene knows the name of the section."""
         return cls.__qualname__
 
 
@@ -232,7 +232,7 @@ class Forcing(TermSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class Continuity(TermSettings):
-    """The continuity equation of smoothed particle hydrodynamics, from the true density on."""
+    """The continuity equation of smoothed particle hydrodynamics, integrated from the true density at the start."""
 
     word = "continuity"
 
@@ -244,7 +244,7 @@ class Continuity(TermSettings):
 
     @property
     def learns_through_horizons(self) -> bool:  # type: ignore[override]
-        """Whether it has a parameter."""
+        """Whether the term has a learned parameter: the coefficient of a diffusion above 0."""
         return self.diffusion > 0
 
 
@@ -329,8 +329,8 @@ PRESETS: dict[str, dict[str, Mapping[str, Any]]] = {
     "paper": _published("paper", (20, 20, 20, 20)),
     "paper-code": _published("unit", (20, 100, 20)),
     "resolved": dict.fromkeys(RESOLVED, {}),
-    # The density is that of the pressure, whose force is there already. As an input of the network it adds nothing, and
-    # doubles the cost, as the forces of a pair are no longer opposite.
+    # The density follows from the pressure, whose force is already a term. As an input of the network it adds nothing,
+    # and doubles the cost, because the forces of a pair are no longer opposite.
     "resolved + pairs": {**dict.fromkeys(RESOLVED, {}), "pairs": {"inputs": ("distance", "speed", "approach")}},
     "local": {"filtered-equations": {}, "eddy-viscosity": {}},
     "wcsph": {"continuity": {}, "wcsph": LITTLE_FRICTION},

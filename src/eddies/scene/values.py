@@ -40,7 +40,7 @@ class KeyProblem(SceneError):
         self.section, self._parts = section, (key, problem)
 
     def within(self, section: str) -> "KeyProblem":
-        """Return the same problem with another name of the section."""
+        """Return the same problem under another section name."""
         return KeyProblem(section, *self._parts)
 
 
@@ -63,7 +63,7 @@ class Section:
 
     @classmethod
     def section_name(cls) -> str:
-        """The name of the section in errors: that of the class in the spelling of scenes."""
+        """The name of the section in errors: the name of the class, written as in scenes."""
         return re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
 
     def problem(self, key: str, problem: str) -> KeyProblem:
@@ -137,9 +137,9 @@ def sections() -> Any:
 
 
 def rule_of(kind: type, field: dataclasses.Field) -> Rule | None:
-    """Return the rule of a field: as declared, or that of its annotation; None for a field that holds sections.
+    """Return the rule that a field declares, or else the rule of its annotation; None for a field that holds sections.
 
-    Raises SceneError for a field with neither.
+    Raises SceneError for a field with neither rule.
     """
     if "section" in field.metadata:
         return None

@@ -17,7 +17,7 @@ class ModeOperators:
 
     Parameters
     ----------
-    wavevector : kx, ky, kz, to broadcast over (kz, ky, kx).
+    wavevector : kx, ky, kz, each of a shape that broadcasts to (kz, ky, kx).
     wavenumber_squared : k^2 (kz, ky, kx).
     stack : numpy.stack or torch.stack.
     """

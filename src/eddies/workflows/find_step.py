@@ -70,7 +70,7 @@ class Stretch:
         self.end = truth.block(self.frame + count * every, ("velocity",))["velocity"]
 
     def distance(self, one: np.ndarray, other: np.ndarray) -> float:
-        """Rms of the difference of two final velocities, relative to that of the true final velocity; collective."""
+        """Rms of the difference of two final velocities, divided by the rms of the true final velocity; collective."""
         sums = np.array([np.sum((one.astype(np.float64) - other) ** 2), np.sum(self.end.astype(np.float64) ** 2)])
         square, size = global_sum(self.truth.decomposition.comm, sums)
         return float(np.sqrt(square / size))
@@ -135,7 +135,7 @@ class Ladder:
         return self.trials[rung]
 
     def difference(self, rung: int) -> float:
-        """Distance of the rollout on a rung from that with twice the step; nan if the latter was not tried."""
+        """Distance between the rollout on a rung and the one with twice its step; nan if the latter was not tried."""
         return self[rung].distance(self.trials.get(rung - 1))
 
     def table(self) -> dict[str, list[float]]:
@@ -229,9 +229,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             "turnovers": span / stretches[0].turnover})
         for name, table in tables.items():
             write_table(file, f"trials/{name}", table)
-    log.info("find-step: %s, %s %.4g, %.3g s a turnover; half of it changes the velocity by %.4f; error %.4f",
-             found.step.integrator, "Courant number" if settings.on_grid else "step", found.step.size, found.seconds,
-             difference, half.error)
+    log.info("find-step: found %s, %s %.4g, %.3g s per turnover. Halving it changes the velocity by %.4f and gives the "
+             "error %.4f", found.step.integrator, "Courant number" if settings.on_grid else "step", found.step.size,
+             found.seconds, difference, half.error)
 
 
 def integrators(settings: Simulation, span: float) -> Iterator[tuple[str, float, int]]:
@@ -257,11 +257,11 @@ def short_rollout(method: Method, step: TimeStep, stretch: Stretch, stop: StopRe
             complaint = method.advance(until, number)
     seconds = comm.bcast((time.perf_counter() - began) * stretch.turnover / max(method.time, 1e-300))
     if complaint is not None:
-        log.info("find-step: %s %.4g: %s", step.integrator, step.size, complaint)
+        log.info("find-step: %s %.4g is unstable: %s", step.integrator, step.size, complaint)
         return Trial(stretch, step, seconds)
     particles, _ = method.frame(float(stretch.stops[-1]))
     columns = particles.to_numpy()
     velocity = IdOrder(comm, columns["id"], total).apply(columns["velocity"])
     trial = Trial(stretch, step, seconds, velocity)
-    log.info("find-step: %s %.4g: error %.4f, %.3g s a turnover", step.integrator, step.size, trial.error, seconds)
+    log.info("find-step: %s %.4g: error %.4f, %.3g s per turnover", step.integrator, step.size, trial.error, seconds)
     return trial

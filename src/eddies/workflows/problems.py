@@ -113,7 +113,7 @@ def _refusals(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
 
 
 def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
-    """Unstable or decayed flows; too many steps, frames, ranks or bytes; too few frames."""
+    """Yield unstable or decayed flows, too many steps, frames, ranks or bytes, and too few frames."""
     scene, stages, expected = step.scene, step.stages, estimate(step.scene)
     tracers, turbulence = scene.tracers, expected.turbulence
     if "dns" in stages:
@@ -173,8 +173,8 @@ def _too_many_frames(tracers: Tracers, span: float) -> Iterator[str]:
 
 def _too_many(key: str, value: float | str, step: float, span: float) -> Iterator[str]:
     if not span <= MOST_STEPS * step:  # also where one is not a number
-        yield (f"{key} = {value}: {span / step:.1e} steps of {step:.3g} for a time of {span:.3g}, and "
-               f"{MOST_STEPS:.0e} are the most; raise it, or lower the turnovers or the duration of the run")
+        yield (f"{key} = {value}: {span / step:.1e} steps of {step:.3g} for a time of {span:.3g}, more than the limit "
+               f"of {MOST_STEPS:.0e}; raise it, or lower the turnovers or the duration of the run")
 
 
 def _too_few_frames(step: Step, turbulence: Turbulence, made: Collection[Path]) -> Iterator[str]:
@@ -274,7 +274,8 @@ def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
                 velocity=None if speed is None else speed / math.sqrt(3), scheme=simulation.scheme))
         yield from beyond_truth(simulation, tracers, scene.seen_in(step.holder("dns")))
     if "train" in stages and model.path and model.weights_file not in made and not model.weights_file.is_file():
-        yield f'[model] path = "{model.path}": there is no {model.weights_file} yet, which `eddies train` needs'
+        yield (f'[model] path = "{model.path}": `eddies train` needs {model.weights_file}, which does not exist yet; '
+               "train that model first, or give another path")
 
 
 def resolution(flow: Flow, turbulence: Turbulence) -> Iterator[str]:
@@ -287,7 +288,7 @@ def resolution(flow: Flow, turbulence: Turbulence) -> Iterator[str]:
         yield (f"[flow] cells = {flow.cells}: k_max eta is about {reached:.2g}, below {least:g}, so that the "
                f"dissipation is not resolved; raise cells to {cells}, or viscosity to {at_least(viscosity)}")
     elif reached > most:
-        yield (f"[flow] cells = {flow.cells}: k_max eta is about {reached:.2g}, and 1 to 2 resolve the dissipation: a "
+        yield (f"[flow] cells = {flow.cells}: k_max eta is about {reached:.2g}, but 1 to 2 resolve the dissipation: a "
                f"step costs {(reached / 2)**3:.0f} times as much as necessary; lower cells to {2 * cells}")
 
 
@@ -331,7 +332,7 @@ def filter_width(tracers: Tracers, flow: Flow, initial: Initial, forcing: Forcin
     if forcing or initial.flow.turbulent:
         highest = forcing.wavenumber if forcing else initial.peak_wavenumber
         if math.pi / width < highest * (1 - 1e-9):
-            yield (f"[tracers] filter_width = {width:.3g}: passes wavenumbers up to {math.pi / width:.2g}, and the "
+            yield (f"[tracers] filter_width = {width:.3g}: passes wavenumbers up to {math.pi / width:.2g}, but the "
                    f"energy is at {highest:g}; lower it to {at_most(math.pi / highest)} or less, or raise "
                    "particles_per_side")
 
@@ -340,8 +341,8 @@ def untrained_terms(model: Model, training: Training) -> Iterator[str]:
     """Terms that are not trained."""
     for name, settings in model.settings.items():
         if settings.learns_through_horizons and training.horizons is None:
-            yield (f'[model] terms: "{name}" is trained through horizons alone, and keeps its initial parameters '
-                   "without them: add [training.horizons]")
+            yield (f'[model] terms: "{name}" learns only in the training through horizons, and the scene has none, so '
+                   "its parameters keep their initial values; add [training.horizons]")
 
 
 def rollout_steps(settings: Simulation, allowed: float | None, model: Model, units: StepUnits) -> Iterator[str]:
@@ -357,7 +358,7 @@ def rollout_steps(settings: Simulation, allowed: float | None, model: Model, uni
 
 
 def beyond_truth(settings: Simulation, tracers: Tracers, seen: float) -> Iterator[str]:
-    """A rollout beyond the end of its ground truth, of which training has seen the fraction `seen`.
+    """A rollout beyond the end of its ground truth. `seen` is the fraction that training has used.
 
     Later frames of a flow that is forced throughout are compared with the mean of the ground truth.
     """
@@ -386,7 +387,7 @@ def check_span(time: Time, span: float, bound: float, tracers: Tracers | None = 
     `bound` is the longest step that the present flow allows. A flow at rest has an infinite `span`.
     """
     if span == math.inf:
-        raise SceneError("the flow is at rest, so that it never turns over; start from another one")
+        raise SceneError("the flow is at rest and has no turnover time; start from another flow")
     key = "step" if time.step else "max_step" if bound >= time.max_step else "courant"
     for problem in [*_too_many_steps(time, key, time.step or min(bound, time.max_step), span),
                     *(_too_many_frames(tracers, span) if tracers is not None else ())]:

@@ -29,8 +29,8 @@ def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
                   if needed not in provenance or provenance[needed].get("id") != known}
         if others:
             named = " and from ".join(_other(needed, origin, present) for needed, present in others.items())
-            or_else = ("read comparisons as those of different flows or models" if any(others.values()) else
-                       "bring back what is missing")
+            or_else = ("note that the report compares different flows or models" if any(others.values()) else
+                       "restore the missing file")
             found.append(f"{_made(kind, origin)} was made from {named}: {make_again(kind)}, or {or_else}")
     return found
 
@@ -41,8 +41,8 @@ def changed_truths(origin: Provenance) -> list[str]:
     `origin` is the provenance of the model. Removed ground truths are skipped.
     """
     now = {path: product_provenance(path).get("id") for path in origin.get("truths", {})}
-    return [f"{_made('model', origin)} was trained on another {path} than is there now; {make_again('model')}, or read "
-            "comparisons as those of another flow"
+    return [f"{_made('model', origin)} was trained on a {path} that has since changed; {make_again('model')}, or note "
+            "that the model has learned from another flow"
             for path, known in origin.get("truths", {}).items() if now[path] not in (None, known)]
 
 

@@ -80,7 +80,7 @@ class Page:
             try:
                 self.images[figure.name] = figures.png(figure.image)
             except Exception as error:  # of matplotlib or its settings: the numbers and other figures are kept
-                log.warning("report: a figure is left out, %s cannot be drawn (%s: %s)", figure.name,
+                log.warning("report: a figure is left out, because drawing %s fails (%s: %s)", figure.name,
                             type(error).__name__, error)
             figure.image = None
 
@@ -100,7 +100,8 @@ class Run:
 
     @classmethod
     def of(cls, directory: Path, first: Sequence[str] = ()) -> Run:
-        """Read a run directory. The main page is that of the first variant of `first` that was run, or of all."""
+        """Read a run directory. The main page shows the first variant of `first` that was run, or else
+        the first of all variants that was run."""
         scene, places = None, {}
         with contextlib.suppress(SceneError):
             scene = load_scene(directory / "scene.toml")
@@ -391,7 +392,8 @@ def _write_main(stored: Run, page: Page, rows: Mapping[str, Row], comm: Comm) ->
     page.seconds = {**read_stage_seconds(stored.directory), **page.seconds}
     _write(page, stored.directory, stored.links(stored.directory), beside, scene)
     for section in page.sections:
-        log.info("report: %s, %d figures", section.title, len(section.illustrations))
+        count = len(section.illustrations)
+        log.info("report: %s%s", section.title, f" ({count} figure{'s' if count > 1 else ''})" if count else "")
         if section.key in (verdict.KEY, table_of_variants.KEY):
             log.info("  %s", section.text)
         for metric in section.metrics:

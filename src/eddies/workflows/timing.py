@@ -98,7 +98,7 @@ def measured(name: str, measure: Callable[[], tuple[float, float, int | None]]) 
         log.info("%-28s  not measured: %s", name, error)
         return False
     if number is None:
-        log.info("%-28s  %8.3g         ?  not known, as the number of steps is not", name, step)
+        log.info("%-28s  %8.3g         ?  unknown, because the number of steps is unknown", name, step)
     else:
         log.info("%-28s  %8.3g  %8d  %s", name, step, number, duration(seconds))
     return True
@@ -108,8 +108,8 @@ def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
                  stop: StepTimes) -> tuple[float, float, int | None]:
     """Estimate a stage of the `whole` scene from a run of the short scene `few`.
 
-    Returns its wall time, the seconds of a step and of what is stored between steps, and the number of steps, None if
-    unknown. A stage without equal steps has 0 steps.
+    Returns the wall time of the stage, the seconds of a step (including storing between steps), and the number of
+    steps, None if unknown. A stage without equal steps has 0 steps.
     """
     stop.check()
     comm, first, expected, once = stop.comm, len(stop.times), estimate(whole), few

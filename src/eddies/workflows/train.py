@@ -51,9 +51,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         data, tests = training_data(definition, settings, trained_on), evaluation_frames(truth)
         model, dtype = data[0].model, data[0].dtype
         for each in data:
-            log.info("train: frames up to %d of the times up to %.3g of %.3g, %d held out; %d weights", each.learned,
-                     each.truth.times[each.last], each.truth.times[-1], each.last - each.learned,
-                     sum(p.numel() for p in model.parameters()))
+            log.info("train: %d parameters; trains on frames up to %d, the next %d are for validation; the training "
+                     "window ends at t = %.3g of %.3g", sum(p.numel() for p in model.parameters()), each.learned,
+                     each.last - each.learned, each.truth.times[each.last], each.truth.times[-1])
         own = next((each.model for each in data if each.truth is truth), None)
         # Where only other ground truths are trained on, no part of the run's own is seen.
         last = last_seen(settings.window if own is not None else 0.0, len(truth.times))
@@ -63,7 +63,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         learns = next(model.parameters(), None) is not None
         phases = [*one_step_phases(data, kernel), *horizon_phases(data)] if learns else []
         if not phases:
-            log.info("train: nothing to learn, because the terms have no parameters or [training] has no steps")
+            log.info("train: no training, because the terms have no parameters or [training] has no steps")
         else:
             training, curves = Training(comm, model, phases), LearningCurves(comm, directory / "learning.png")
             take_all_steps(training, guard, "train", "training", "lower learning_rate here or in [training.horizons], "
@@ -88,8 +88,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     errors = tables["a_priori"]
     beside = (f" (exact filtered pressure gradient {errors['pressure_gradient_error'][-1]:.3f})"
               if "pressure_gradient_error" in errors else "")
-    since = "training window" if own is not None else "release of the tracers, none of which were trained on"
-    log.info("model: acceleration error %.3f at a time %.3g after the %s%s", errors["acceleration_error"][-1],
+    since = "training window" if own is not None else "release of the tracers; trained on other ground truths"
+    log.info("model: a-priori acceleration error %.3f, a time of %.3g after the %s%s", errors["acceleration_error"][-1],
              errors["delay"][-1], since, beside)
 
 

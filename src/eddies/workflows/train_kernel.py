@@ -116,7 +116,7 @@ def training_of(settings: Kernel, support: float, mean_volume: float | None, see
                 samples: list[KernelSample]) -> Training:
     """The training of the kernel with the gradient loss, then without it.
 
-    `mean_volume` is that of a particle, for a kernel that may be negative; None for a positive kernel.
+    `mean_volume` is the mean volume of a particle, for a kernel that may be negative; None for a positive kernel.
     """
     dtype, rates = samples[0].particles.dtype, (settings.learning_rate, settings.final_learning_rate)
     networks, phases = nn.ModuleDict(), []

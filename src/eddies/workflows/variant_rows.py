@@ -72,7 +72,7 @@ def together(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Combine the numbers of several realisations.
 
     Errors become a mean and a standard deviation, if all realisations have them. Times become a median, with the widest
-    quartiles. The status is that of the first realisation that did not reach its end, if there is one.
+    quartiles. The status comes from the first realisation that did not reach its end, if there is one.
     """
     found: dict[str, Any] = {"realisations": len(realised), "status": "complete"}
     found |= next(({key: one[key] for key in ("status", "stopped_at")} for one in realised
@@ -110,27 +110,27 @@ def before(place: Place, alone: Comm) -> dict[str, Any]:
 
 
 def has_own_kernel(scene: Scene, variant: Scene) -> bool:
-    """Return whether the smoothing kernel of a variant differs from that of the scene, so that the numbers of
-    THROUGH_KERNEL cannot be compared."""
+    """Return whether a variant and its scene have different smoothing kernels, so that the numbers of THROUGH_KERNEL
+    cannot be compared."""
     return len({stage_fingerprint(each, "train-kernel") for each in (scene.without_variants, variant)}) > 1
 
 
 def notes(scene: Scene) -> list[str]:
-    """Return sentences that a reader must know about the numbers."""
+    """Return the sentences that a reader needs to interpret the numbers."""
     seeds, variants = scene.realisations, scene.variant or {scene.name: scene}
     found = [f"Mean and standard deviation over {len(seeds)} realisations, seeds {', '.join(map(str, seeds))}, that no "
              "training has seen." if seeds and len(seeds) > 1 else
-             "Numbers of one realisation: a difference smaller than that between two flows means nothing."]
+             "All numbers are from one realisation, so small differences may be due to chance."]
     own = [name for name, variant in variants.items() if has_own_kernel(scene, variant)]
     if own:
         blank = " and ".join(MEASURES[measure] for measure in THROUGH_KERNEL)
         found.append(f"{', '.join(own)}: no {blank}. These numbers need the smoothing kernel, and a kernel with other "
-                     "settings than the scene's shows another part of the flow.")
+                     "settings than the scene's would give values that cannot be compared.")
     grids = {name: (variant.eulerian or Eulerian()).cells_for(variant.tracers.filter_width)
              for name, variant in variants.items() if variant.simulation.on_grid}
     if grids:
         kept = ", ".join(f"{(cells - 1) // 3} in {name}" for name, cells in grids.items())
-        found.append(f"The 2/3 rule keeps the wavenumbers |k_i| < cells/3 of a grid, at most: {kept}; k_d = "
+        found.append(f"Largest wavenumber |k_i| that a grid keeps by the 2/3 rule: {kept}; k_d = "
                      f"{np.pi / scene.tracers.filter_width:.3g}.")
     return found
 

@@ -151,5 +151,5 @@ def check_unseen(scene: Scene, directory: Path) -> None:
         for seed in scene.realisations or ():
             path = directory / f"{REALISATION}{seed}" / STAGES["dns"].file
             if path.resolve() in trained_on:
-                raise SceneError(f"{name}: is trained on {path}, by [training] truths; leave {seed} out of "
-                                 "realisations")
+                raise SceneError(f"{name}: [training] truths names {path}, which is a realisation; remove {seed} "
+                                 "from realisations")

@@ -111,7 +111,7 @@ UNEVEN = np.float32(2 * np.pi * np.arange(STORED) / STORED) + np.float32(0.1) * 
 
 REFUSED = {
     "a part": (lambda path: write_cutout(path, [stored_velocity()], points=PART), "xcoor goes from 0 to 0.0674952"),
-    "uneven": (lambda path: write_cutout(path, [stored_velocity()], points=UNEVEN), "no whole periodic cube"),
+    "uneven": (lambda path: write_cutout(path, [stored_velocity()], points=UNEVEN), "not the whole periodic cube"),
     "nowhere": (lambda path: write_cutout(path, [stored_velocity()], coordinates=("xcoor", "ycoor")), "no zcoor"),
     "flat": (lambda path: write_cutout(path, [stored_velocity()[:, :8]]), r"Velocity_0009: .* shape \(8, 12, 12, 3\)"),
     "scalar": (lambda path: write_cutout(path, [stored_velocity()[:1]]), r"Velocity_0009: .* shape \(12, 12, 12, 1\)"),

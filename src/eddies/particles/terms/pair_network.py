@@ -149,7 +149,7 @@ class DensityFlux(PairTerm):
     """d rho_i/dt = r_rms s sum_j w NN_rho, or w NN_rho sign(rho_i - rho_j), a function of the invariants of a pair.
 
     r_rms is the rms of the density rate and NN_rho a network of its own; w, s and the invariants are as in PairNetwork.
-    The paper does not state what replaces b_k for the density; the sign is that of the public code.
+    The paper does not state what replaces b_k for the density. The sign is taken from the public code.
     """
 
     Settings = declared.DensityFlux

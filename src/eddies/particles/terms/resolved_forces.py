@@ -145,8 +145,8 @@ class Forcing(Term):
         flow, below = context.resolved, self.settings.wavenumber
         square = flow.mean_square(flow.unfiltered, 0, below)
         if square == 0 and self.settings.injection_rate > 0:
-            raise declared.TermError("injection: the particles have no energy at the forced wavenumbers; leave the "
-                                     "forcing out, or raise its wavenumber to scales at which they move")
+            raise declared.TermError("injection: the particles have no energy at the forced wavenumbers; remove "
+                                     "the forcing, or raise its wavenumber until they have energy there")
         amplitude = self.settings.injection_rate / square if square > 0 else 0.0
         shell = flow.grid.shell
         return Rates(force_modes=amplitude * torch.where((shell > 0) & (shell < below), flow.velocity, 0))

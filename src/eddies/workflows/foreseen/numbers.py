@@ -174,8 +174,8 @@ def courant_step(flow: Flow, time: Time, speed: float | None) -> float | None:
 
 
 def flow_step(time: Time, bound: float | None) -> tuple[float | None, str]:
-    """Time step of the direct simulation, and the key of [time] that limits it; `bound` is that of the Courant
-    number."""
+    """Time step of the direct simulation, and the key of [time] that limits it. `bound` is the longest step that the
+    Courant number allows."""
     if time.step is not None:
         return time.step, "step"
     if bound is None:

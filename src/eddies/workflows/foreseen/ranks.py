@@ -59,9 +59,9 @@ def most_ranks(scene: Scene) -> dict[str, int]:
 
 def horizon_limits(horizons: Horizons | None, tracers: Tracers, velocity: float, neighbors: float,
                    resolves: bool) -> dict[str, int]:
-    """Limits of the training through horizons, in which no particle changes its rank.
+    """Limits on the number of ranks from the training through horizons, where particles stay on their rank.
 
-    `velocity` is the rms of a component, `neighbors` is 0 for a model without pairs.
+    `velocity` is the rms of a component; `neighbors` is 0 for a model without pairs.
     """
     limits: dict[str, int] = {}
     if horizons is None:
@@ -96,8 +96,8 @@ def rank_problems(limits: Mapping[str, int], ranks: int) -> Iterator[str]:
     """The problem of more ranks than the strictest limit."""
     reason = min(limits, key=limits.__getitem__)
     if ranks > limits[reason]:
-        yield (f"{ranks} ranks are more than the {limits[reason]} that it can use ({reason}); start at most "
-               f"{limits[reason]}, `eddies check` gives all limits")
+        yield (f"{ranks} ranks are more than the limit of {limits[reason]} ({reason}); start at most {limits[reason]}. "
+               "`eddies check` lists all limits")
 
 
 def reach_limit(tracers: Tracers, reach: float, when: str = "") -> dict[str, int]:

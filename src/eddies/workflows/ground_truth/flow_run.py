@@ -74,7 +74,7 @@ class FlowRun:
                 observer(self.state, self.clock)
 
     def state_dict(self) -> dict[str, Any]:
-        """The state for a checkpoint, with that of the tracers."""
+        """The state for a checkpoint, with the state of the tracers."""
         modes = saved_modes(self.fluid.grid, self.state)
         return {"phase": self.phase, "modes": modes, "clock": self.clock.state_dict(),
                 "step_limit": self.step_limit.state_dict(), "watch": self.watch.state_dict(),

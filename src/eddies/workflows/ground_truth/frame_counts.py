@@ -71,14 +71,14 @@ def between_frames(frames: int, at_fields: Sequence[int]) -> list[int]:
 
 
 def rollout_start(settings: Simulation, tracers: Tracers, seen: float, frames: int, at_fields: Sequence[int]) -> int:
-    """The first frame with a filtered field at or after [simulation] start, or after the part that the model was
-    trained on. Raises SceneError without a later frame to compare with."""
+    """The first frame with a filtered field at or after [simulation] start, by default the end of the training window.
+    Raises SceneError if the ground truth ends before the next frame of the rollout."""
     wanted = _frame_at(settings.start, seen, frames)
     last = frames - 2 - round(settings.frame_interval / tracers.frame_interval)
     usable = [frame for frame in at_fields if wanted <= frame <= last]
     if not usable:
-        raise SceneError(f"[simulation] start: after frame {wanted} of {frames} no filtered field is followed by "
-                         f"ground truth to compare with, {settings.frame_interval:g} later; lower start, "
+        raise SceneError(f"[simulation] start: from frame {wanted} of {frames} on, no filtered field is followed by "
+                         f"ground truth for {settings.frame_interval:g}, the first frame interval; lower start, "
                          "frame_interval, [training] window or [tracers] field_every, or raise [tracers] turnovers")
     return usable[0]
 

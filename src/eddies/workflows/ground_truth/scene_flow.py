@@ -100,8 +100,8 @@ def _state_from_file(initial: Initial, fluid: Fluid) -> np.ndarray:
             # The same density would mean another pressure, and the part out of balance with the velocity is sound.
             density *= (stored_speed / fluid.sound_speed) ** 2
             if comm.rank == 0:
-                log.info("dns: the file holds a flow with the speed of sound %g: fluctuations of ln(density) are "
-                         "multiplied by %.3g, which keeps the pressure", stored_speed,
+                log.info("dns: the flow in the file has the sound speed %g; fluctuations of ln(density) are "
+                         "multiplied by %.3g to keep the pressure", stored_speed,
                          (stored_speed / fluid.sound_speed) ** 2)
         return np.concatenate([velocity, density])
     # The velocity of a compressible flow, in single precision or on fewer points, is not exactly solenoidal.

@@ -63,7 +63,7 @@ def take_from_first_rank(model: nn.Module, comm: Comm) -> None:
         raise SceneError(complaint)
     shapeless = next((name for name, tensor in tensors if is_lazy(tensor)), None)
     if shapeless is not None:
-        raise SceneError(f"[model] terms: {shapeless} has no shape yet, as in a lazy module; give the module its sizes")
+        raise SceneError(f"[model] terms: {shapeless} has no shape, as in a lazy module; give the module its sizes")
     differing = []
     for name, tensor in tensors:
         values = tensor.detach().cpu().contiguous()
@@ -102,7 +102,7 @@ def load_model(definition: ModelDefinition, comm: Comm, path: str | Path, scales
     model = initial_model(definition, scales, comm)
     expected = {name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}
     if expected != {name: tensor.shape for name, tensor in weights.items()}:
-        raise ProductError(f"{path}: has other parameters than its terms have now; remove it and run `eddies train` "
+        raise ProductError(f"{path}: its parameters do not fit the present terms; remove it and run `eddies train` "
                            "again")
     precision = next((tensor.dtype.name for tensor in weights.values()), "float64")
     model.to(getattr(torch, precision))

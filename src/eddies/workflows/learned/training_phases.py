@@ -24,7 +24,7 @@ from eddies.workflows.learned.training_data import TrainingData
 
 log = logging.getLogger("eddies")
 
-# Particles for the validation error of the acceleration, and cubes or batches for that of all losses.
+# Particles for the validation error of the acceleration, and cubes or batches for the validation error of all losses.
 VALIDATION_PARTICLES, COMBINED_DRAWS = 8192, 8
 # Number of validations in a phase.
 VALIDATIONS, HORIZON_VALIDATIONS = 25, 4

@@ -1,4 +1,4 @@
-"""Use of a model on another flow than that of its training: the weights of the source with the scales of this flow."""
+"""Use of a trained model on another flow: the weights of the source with the scales of this flow."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def run(scene: Scene, comm: Comm, directory: Path) -> None:
 
     Terms work in units of the flow (Eq. 4), so only the scales and the radius of interaction are those of this flow.
     Tables are copied from the source, except the a-priori tests, which are repeated on this flow. The tests on the flow
-    of the training are kept as `source_a_priori` if the source has them. The cost of training is that of the source.
+    of the training are kept as `source_a_priori` if the source has them. The cost of training is copied too.
     """
     source, definition = read_source(scene, comm), ModelDefinition.of(scene)
     slab, device = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes), prepare_torch(scene.device, comm)

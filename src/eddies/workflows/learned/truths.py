@@ -1,4 +1,4 @@
-"""The ground truths that a model is trained on: that of the run, or those that [training] truths names."""
+"""The ground truths that a model is trained on: the one of the run, or those that [training] truths names."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ from eddies.workflows.ground_truth.truth import GroundTruth
 @contextmanager
 def open_truths(own_file: Path, named: Sequence[Path], tracers: Tracers, comm: Comm,
                 device: torch.device) -> Iterator[tuple[GroundTruth, list[GroundTruth]]]:
-    """Open the ground truth of a run, and those that are named for training (if none, that of the run); collective."""
+    """Open the ground truth of a run, and the ground truths that are named for training; collective.
+
+    If none is named, the run's own ground truth is used for training.
+    """
     with ExitStack() as files:
         def opened(path: Path) -> GroundTruth:
             return _truth_in(files.enter_context(open_product(comm, path, "ground_truth")), tracers, comm, device)

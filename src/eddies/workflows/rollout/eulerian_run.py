@@ -33,7 +33,7 @@ from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.particle_run import forcing_of
 from eddies.workflows.rollout.saved_particles import restored_rows, saved_rows
 
-# A flow is unstable if its energy exceeds that of its start by this factor.
+# A flow is unstable if its energy exceeds its initial energy by this factor.
 RUNAWAY_ENERGY = 100.0
 
 
@@ -79,7 +79,8 @@ class EulerianRun:
         return self.clock.time
 
     def advance(self, until: float, number: int) -> str | None:
-        """Take one of the equal steps to a time. Returns None, or on all ranks what is wrong with the new state.
+        """Take the first of equal steps that end at the time `until`. Returns on all ranks the fault of the new state,
+        or None.
 
         The Courant number of the present flow and [simulation] step limit the step.
         """
@@ -180,8 +181,8 @@ def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float, dire
 def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame: int) -> np.ndarray:
     """The modes of the true flow at a frame that the grid of a fluid holds, after a filter of the velocity.
 
-    The density is that of the frame, or in balance with a filtered velocity. Raises SceneError if the unfiltered flow
-    is not stored at that frame.
+    The density is read from the frame, or is in balance with a filtered velocity. Raises SceneError if the unfiltered
+    flow is not stored at that frame.
     """
     grid, series = fluid.grid, truth.states
     if frame not in truth.at_states:

@@ -31,7 +31,7 @@ class Method(Protocol):
 
     def advance(self, until: float, number: int) -> str | None:
         """Take one step, the `number`-th, towards the time `until`. The step may pass that time if `frame` can
-        interpolate. Returns None, or on all ranks what is wrong with the new state."""
+        interpolate. Returns on all ranks the fault of the new state, or None."""
 
     def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
         """The particles at a time within the last step, in any order, and their acceleration (n, 3)."""
@@ -65,9 +65,9 @@ class TimeStep:
 
 
 def make_method(scene: Scene, step: TimeStep | None, truth: GroundTruth, start: int, directory: Path) -> Method:
-    """The method of a scene, starting at a frame of the truth. A given `step` replaces that of the scene; collective.
+    """The method of a scene, starting at a frame of the truth. A given `step` replaces the scene's step; collective.
 
-    With a given step the limit that the resolved velocity sets to steps is ignored.
+    With a given step, the step limit of the resolved velocity is ignored.
     """
     settings = scene.simulation
     if step is not None and settings.on_grid:

@@ -51,7 +51,7 @@ class FieldsOfParticles:
         y, x = torch.meshgrid(axis, axis, indexing="ij")
         middle = torch.full_like(x, self.slab.planes // 2 * self.slab.spacing)
         velocity, gradient = self._made(particles, frame).at(torch.stack([x, y, middle], -1).reshape(-1, 3))
-        antisymmetric = gradient - gradient.transpose(1, 2)  # its norm is sqrt(2) times that of the vorticity
+        antisymmetric = gradient - gradient.transpose(1, 2)  # its norm is sqrt(2) times the vorticity
         vorticity = antisymmetric.square().sum((1, 2)).div(2).sqrt()
         return self._by_component(velocity, 2), as_numpy(vorticity).reshape([self.slab.planes] * 2)
 
@@ -146,7 +146,6 @@ class ParticleSpectra:
                 {"id": np.arange(len(position)), "position": position, "velocity": velocity}))
         if not flow.converged:
             self.complaints.append(
-                f"at time {particles.times[frame]:.3g} particles of the {whose} have clustered and left voids: the "
-                f"solve for their spectrum did not converge in {flow.iterations} iterations and left "
-                f"{flow.residual:.1e}")
+                f"at time {particles.times[frame]:.3g} the solve for the spectrum of the {whose} did not converge in "
+                f"{flow.iterations} iterations (residual {flow.residual:.1e}): particles have clustered and left voids")
         return as_numpy(flow.spectrum[:max(self._resolution.grid.resolved, 2)]).astype(float)

@@ -82,10 +82,10 @@ class ParticleRun:
         return self.dynamics.time
 
     def advance(self, until: float, number: int) -> str | None:
-        """Take one step towards a time. Returns None, or on all ranks what is wrong with the new state.
+        """Take one step towards the time `until`. Returns on all ranks the fault of the new state, or None.
 
-        The step is that of the scene, or shorter if the flow demands it. A scheme with dense output may step beyond
-        that time; steps of other schemes end there.
+        The step is as long as the scene allows, or shorter if the flow demands it. A scheme with dense output may step
+        beyond `until`. Steps of other schemes end there.
         """
         step, left = min(self.settings.longest_step, self._allowed_step()), until - self.time
         if not self.integrator.scheme.dense:

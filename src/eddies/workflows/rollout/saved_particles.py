@@ -1,4 +1,5 @@
-"""Particles in checkpoints. Each rank gets back its own rows in the same order, so that sums over them are equal."""
+"""Particles in checkpoints. On the same number of ranks each rank gets its own rows back in the same order, so that
+sums over particles are equal to the last bit."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def stage_provenance(scene: Scene, stage: str) -> dict[str, Any]:
 
 
 def _without(value: Any, section: str, keys: Sequence[str]) -> Any:
-    """The values of a section without some keys "section.key"; any other value as it is."""
+    """The values of a section without some keys "section.key"; any other value is returned unchanged."""
     if not isinstance(value, dict):
         return value
     return {key: each for key, each in value.items() if f"{section}.{key}" not in keys}

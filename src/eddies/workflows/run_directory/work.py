@@ -115,7 +115,7 @@ def read_stage_seconds(directory: Path) -> dict[str, float]:
     try:
         return {stage: float(value) for stage, value in json.loads(path.read_text()).items()}
     except (AttributeError, TypeError, ValueError):
-        raise ProductError(f"{path}: is not what the stages wrote; delete it, the report does without") from None
+        raise ProductError(f"{path}: is damaged; delete it, because the report can do without it") from None
 
 
 def changed_settings(stage: Stage, then: str | None, now: str | None) -> list[str]:
