@@ -106,7 +106,7 @@ BAD_OVERRIDES = [
     ("training.batch=5000", "[training] batch = 5000: must be at most the number of particles, 1728"),
     ("training.combined_steps=0", "set both the steps and a weight above 0, or neither"),
     ("training.combined_steps=100", "[training] combined_steps = 100: must be at most steps = 60"),
-    ("training={field_target = 'flow', frames = 2, batch = 9, steps = 9}", '[training] field_target = "flow": is of'),
+    ("training={field_target = 'flow', frames = 2, batch = 9, steps = 9}", '[training] field_target = "flow": applies to the field loss'),
     ("training.final_learning_rate=1", "[training] final_learning_rate = 1: must be at most learning_rate"),
     ("training.horizons={steps = 1, learning_rate = 1e-5}", "must be at most [training.horizons] learning_rate"),
     ("training.horizons={steps = 1, time_step = 0.03}", "[training.horizons] time_step = 0.03: [tracers] frame_"),

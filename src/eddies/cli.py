@@ -71,9 +71,9 @@ def run(arguments: list[str] | None) -> int:
     """Run one command on all ranks and return its exit code."""
     # Before numpy and torch are imported, which would start a thread for each core in each rank.
     default_to_one_thread()
+    signals = catch_signals()  # early, because numpy and MPI take a second to start
     from eddies.kernels.library import keep_freed_memory
     keep_freed_memory()
-    signals = catch_signals()  # early, because MPI takes a second to start
     try:
         from mpi4py import MPI
     except (ImportError, RuntimeError) as error:  # the wheel of mpi4py has no MPI library

@@ -149,9 +149,9 @@ def transform_bounds(grid: SpectralGrid, backward: int, sent: int, forward: int)
     """Seconds of transforms by FFTW alone; of the `backward` components, `sent` are also transformed along z."""
     count, planes = grid.decomposition.count, 0.0
     for direction, components in (("BACKWARD", backward), ("FORWARD", forward)):
-        for pairs, blocks in Counter((b.stop - b.start + 1) // 2 for b in grid.plane_pass.blocks(count)).items():
-            plans = grid.plane_pass.plans(direction, components, pairs).plans
-            planes += blocks * best(lambda: [plan.execute() for of_field in plans for plan in of_field])
+        for block in grid.plane_pass.blocks(count):
+            plans = grid.plane_pass.plans(direction, components, block).plans
+            planes += best(lambda: [plan.execute() for of_field in plans for plan in of_field])
     columns = 0.0
     for direction, components in (("BACKWARD", sent), ("FORWARD", forward)):
         for rows in grid.column_pass.rows(grid.spectral_shape[1]):
@@ -161,8 +161,8 @@ def transform_bounds(grid: SpectralGrid, backward: int, sent: int, forward: int)
 
 def sent_bytes(grid: SpectralGrid) -> int:
     """Bytes that a rank sends in a step."""
-    return EVALUATIONS * sum(lines.nbytes for lines in (grid.batch("backward", SENT).transpose._columns,
-                                                        grid.batch("forward", FORWARD).transpose._planes))
+    return EVALUATIONS * sum(lines.nbytes for lines in (grid._batch("backward", SENT).transpose._columns,
+                                                        grid._batch("forward", FORWARD).transpose._planes))
 
 
 def measure(comm: MPI.Comm, watch: Stopwatch, cells: int, precision: str, steps: int, share_of: int) -> dict:

@@ -158,7 +158,7 @@ def test_forcing_while_tracers_are_followed():
     assert scene.injects and not load_scene(TINY).injects
     assert not load_scene(TINY, ["tracers.forced=true", "simulation.injection=none"]).injects
     replace(scene, spin_up=None)
-    with pytest.raises(SceneError, match=r"\[tracers\] forced = true: there is no \[forcing\]"):
+    with pytest.raises(SceneError, match=r"\[tracers\] forced = true: needs a section \[forcing\]"):
         replace(scene, forcing=None)
 
 

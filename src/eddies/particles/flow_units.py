@@ -64,9 +64,10 @@ class ReferenceScales:
         for name, value in asdict(self).items():
             vanishes = name in MAY_VANISH and value == 0
             if value is not None and not vanishes and not (math.isfinite(value) and value > 0):
-                sign = "not negative" if name in MAY_VANISH else "positive"
-                raise ScaleError(f"reference scale {name} = {value}: must be finite and {sign} to make models "
-                                 "dimensionless; start from a flow that moves and changes ([initial], [forcing])")
+                allowed, remedy = (("not negative", "start from another flow ([initial])") if name in MAY_VANISH else
+                                   ("positive, as a model is made dimensionless by it",
+                                    "start from a flow that moves and changes ([initial], [forcing])"))
+                raise ScaleError(f"reference scale {name} = {value}: must be finite and {allowed}; {remedy}")
 
     def required(self, name: str) -> float:
         """A scale by name. Raises ValueError if the flow has no density, and so no scale of density or sound."""

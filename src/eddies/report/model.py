@@ -114,10 +114,10 @@ def source_metrics(mach: float | None, errors: Table, source_mach: float | None,
         chosen = table["acceleration_error"][table["delay"] > 0]
         return float(chosen.mean()) if len(chosen) else None
 
-    incompressible, seen = "an incompressible fluid has none", "no error after the training window is stored"
-    return [Metric("mach_turbulent", "turbulent Mach number M_t", mach, incompressible),
-            Metric("source_mach_turbulent", "M_t of the flow that the model was trained on", source_mach,
-                   incompressible),
+    unknown = "an incompressible fluid has none, or it was not stored with these weights"
+    seen = "no error after the training window is stored; train the model with a [training] window below 1"
+    return [Metric("mach_turbulent", "turbulent Mach number M_t", mach, unknown),
+            Metric("source_mach_turbulent", "M_t of the flow that the model was trained on", source_mach, unknown),
             Metric("source_acceleration_error", "mean acceleration error in that flow, after the training window",
                    unseen(source_errors), seen),
             Metric("unseen_acceleration_error", "mean acceleration error in this flow", unseen(errors), seen)]

@@ -24,7 +24,8 @@ LINES = {"truth": {"label": "true tracers", "color": TRUTH},
 @styled
 def velocity_planes(pairs: Sequence[Pair], turnover: float) -> Figure:
     """Draw u_x in planes [y, x] over time, truth above and model below, with one colour scale."""
-    figure, axes = panels(2, len(pairs), (2.665, 2.675), right=BAR, sharex=True, sharey=True)
+    figure, axes = panels(2, len(pairs), ((2.3 * len(pairs) + 1.46) / len(pairs), 2.675), right=BAR, sharex=True,
+                          sharey=True)
     limit = largest(*(pair.truth for pair in pairs))
     for column, pair in zip(axes.T, pairs):
         image = show_plane(column[0], pair.truth, (-limit, limit), SIGNED)
@@ -218,9 +219,10 @@ def invariant_plane(statistics: InvariantStatistics,
     bins = statistics.bins
     across, up = _centres(bins.third)[-2], _centres(bins.second)[-2]
     densities = [bins.density(cells) for cells in (statistics.truth, statistics.model)]
-    # Levels are half a decade apart, from the peak of the truth down to the density of a single particle.
+    # Levels are half a decade apart, from the peak of the truth down to the density of a single particle; at least two.
     peak, single = (np.log10(extreme) for extreme in (densities[0].max(), densities[0][densities[0] > 0].min()))
-    levels = 10.0 ** (np.arange(np.floor(2 * peak), 2 * single, -1)[:8][::-1] / 2)
+    top = np.floor(2 * peak)
+    levels = 10.0 ** (np.arange(top, min(2 * single, top - 1.5), -1)[:8][::-1] / 2)
     for axis, density, name in zip(axes[0], densities, names):
         # The outer cells also count all values beyond them. An empty cell has no logarithm.
         shown = np.maximum(density[1:-1, 1:-1], 1e-3 * levels[0])

@@ -122,19 +122,21 @@ def _with_spread(row: Row, column: str) -> Any:
 def scatter(table: ErrorAgainstTime, measures: Sequence[str]) -> Figure:
     """Draw error against wall seconds per turnover, with one panel for each measure."""
     columns = min(len(measures), 2)
-    figure, axes = panels(-(-len(measures) // columns), columns, (5.4, 4.2) if columns == 2 else (9.3, 6.0), foot=0.35)
+    styles = [Line2D([], [], color=colour, marker=marker, linestyle="", label=kind)
+              for kind, (colour, marker) in table.looks.items()]
+    if table.stopped():
+        styles.append(Line2D([], [], color=DNS, marker="x", linestyle="", label="unstable, at this time"))
+    styles.append(Line2D([], [], color=GUIDE, linestyle="--", label="Pareto front"))
+    across = 5  # entries in a line of the legend
+    figure, axes = panels(-(-len(measures) // columns), columns, (5.4, 4.2) if columns == 2 else (9.3, 6.0),
+                          foot=0.15 + 0.2 * -(-len(styles) // across))
     FigureCanvasAgg(figure)  # measures the names of points
     for axis in axes.flat[len(measures):]:
         axis.remove()
     for axis, measure in zip(axes.flat, measures):
         _draw_panel(axis, table, measure)
     letter(axes.flat[:len(measures)])
-    styles = [Line2D([], [], color=colour, marker=marker, linestyle="", label=kind)
-              for kind, (colour, marker) in table.looks.items()]
-    if table.stopped():
-        styles.append(Line2D([], [], color=DNS, marker="x", linestyle="", label="unstable, at this time"))
-    styles.append(Line2D([], [], color=GUIDE, linestyle="--", label="Pareto front"))
-    figure.legend(handles=styles, loc="lower center", ncols=8, columnspacing=1.2, handletextpad=0.4)
+    figure.legend(handles=styles, loc="lower center", ncols=across, columnspacing=1.2, handletextpad=0.4)
     return figure
 
 
