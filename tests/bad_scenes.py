@@ -106,7 +106,8 @@ BAD_OVERRIDES = [
     ("training.batch=5000", "[training] batch = 5000: must be at most the number of particles, 1728"),
     ("training.combined_steps=0", "set both the steps and a weight above 0, or neither"),
     ("training.combined_steps=100", "[training] combined_steps = 100: must be at most steps = 60"),
-    ("training={field_target = 'flow', frames = 2, batch = 9, steps = 9}", '[training] field_target = "flow": applies to the field loss'),
+    ("training={field_target = 'flow', frames = 2, batch = 9, steps = 9}",
+     '[training] field_target = "flow": applies to the field loss'),
     ("training.final_learning_rate=1", "[training] final_learning_rate = 1: must be at most learning_rate"),
     ("training.horizons={steps = 1, learning_rate = 1e-5}", "must be at most [training.horizons] learning_rate"),
     ("training.horizons={steps = 1, time_step = 0.03}", "[training.horizons] time_step = 0.03: [tracers] frame_"),
@@ -136,8 +137,8 @@ INFEASIBLE = [
      "[simulation] start: from frame 52 of 106 on, no filtered field is followed by ground truth for 2"),
     ("simulation.start=0.99", "[simulation] start: from frame 103 of 106 on, no filtered field is followed by ground"),
     ("tracers.field_every=500", "[tracers] field_every: no filtered field is stored between the first and the last"),
-    ("tracers.turnovers=0.01", "[training] window = 0.5: holds 1 frames of the ground truth, too few with 2 held out"),
-    ("training.window=0.01", "[training] window = 0.01: holds 1 frames of the ground truth, too few with 2 held out "
+    ("tracers.turnovers=0.01", "[training] window = 0.5: holds 2 frames of the ground truth, too few with 2 held out"),
+    ("training.window=0.01", "[training] window = 0.01: holds 2 frames of the ground truth, too few with 2 held out "
      "for validation and horizons of 0; raise it or [tracers] turnovers, or lower"),
     ("training.horizons={steps = 1, frames = [50]}", "50 held out for validation and horizons of 50; raise it or"),
 ]

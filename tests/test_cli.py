@@ -359,6 +359,14 @@ def test_a_limit_of_wall_time_or_a_file_stops_the_job(comm, tmp_path, capfd):
     assert one_line(comm, capfd, "STOP: ")
 
 
+def test_signals_are_caught_before_slow_imports():
+    code = ("import sys, eddies.cli as cli\ncatch = cli.catch_signals\n"
+            "cli.catch_signals = lambda: print([name for name in ('numpy', 'mpi4py.MPI') if name in sys.modules]) or "
+            "catch()\ncli.run(['scenes'])\n")
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.returncode == 0 and ended.stdout.startswith("[]\n"), ended
+
+
 @pytest.mark.parametrize("number, then", [(signal.SIGTERM, "signal.raise_signal(15)"),
                                           (signal.SIGUSR1, "eddies.cli.release_signals(received)")])
 def test_a_second_sigterm_and_released_signals_end_the_process(number, then):

@@ -81,12 +81,14 @@ def simulate(scene: Scene | str | Path, *, output: str | Path | None = None, ove
 def _job(comm: Comm | None) -> Iterator[Comm]:
     """The communicator of a job, by default the one of all ranks.
 
-    Log lines go to standard output unless the program has set up logging. An error that only some ranks meet ends the
-    job, because the others may wait for them.
+    Log lines go to standard output unless the program has set up logging. An error of several ranks ends the job if
+    only some of them meet it, because the others may wait for them, or if HDF5 could not write a file, because HDF5
+    then crashes at exit.
     """
     default_to_one_thread()
     from mpi4py import MPI
 
+    from eddies.io.new_files import writing_failed
     from eddies.kernels.library import library
     from eddies.parallel.connection import all_arrive, require_connected
     if comm is None:
@@ -100,7 +102,7 @@ def _job(comm: Comm | None) -> Iterator[Comm]:
         library()  # sets the threads, which torch shares
         yield comm
     except BaseException:
-        if comm.size > 1 and not all_arrive(errors):
+        if comm.size > 1 and (writing_failed() or not all_arrive(errors)):
             traceback.print_exc()
             sys.stderr.flush()
             comm.Abort(1)

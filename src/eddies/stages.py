@@ -20,11 +20,12 @@ from eddies.io.errors import WriteError
 from eddies.io.hdf5 import in_files, open_product
 from eddies.io.provenance import product_fingerprint
 from eddies.io.run_lock import RunInUse, RunTakenOver, lock_directory, refuse_if_held
-from eddies.io.new_files import LARGEST_BYTES, has_single_writer, write_files
+from eddies.io.new_files import LARGEST_BYTES, has_single_writer, write_files, writing_failed
 from eddies.parallel.broadcast import on_first_rank, require_same
 from eddies.logs import OUTCOME
 from eddies.parallel.communicator import Comm, warn_of_few_processors
 from eddies.parallel.connection import all_arrive
+from eddies.parallel.reduction import any_rank
 from eddies.parallel.stop import Stopped, StopRequest
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene, SceneError
@@ -129,8 +130,8 @@ def run_steps(planned: Sequence[Step], comm: Comm, directory: Path, stop: StopRe
         except (WriteError, RunInUse, RunTakenOver):  # these concern all variants
             raise
         except UserError as error:
-            if step.variant is None or not all_arrive(errors):
-                raise
+            if step.variant is None or not all_arrive(errors) or any_rank(errors, writing_failed()):
+                raise  # also if HDF5 could not write a file: the job must then be aborted
             failures[step.variant] = str(error)
             log.log(OUTCOME, "variant %s failed: %s", step.variant, error)
             text = f"{error}\n"

@@ -1,5 +1,6 @@
 """Checkpoints are complete and undamaged, or are not used."""
 
+import errno
 import os
 import random
 import re
@@ -14,9 +15,10 @@ import h5py
 import numpy as np
 import pytest
 
+from eddies.io import checksums
 from eddies.io.checkpoint import Block, CheckpointDirectory, Guard, checkpoints_in
 from eddies.io.checksums import add_checksums
-from eddies.io.errors import WriteError
+from eddies.io.errors import ProductError, WriteError
 from eddies.parallel.slab import block_starts
 from eddies.parallel.stop import Stopped, StopRequest
 from tests.full_disk import largest_file
@@ -97,6 +99,49 @@ def test_which_checkpoints_are_used(comm, tmp_path, caplog, monkeypatch):
     monkeypatch.undo()
     assert directory.newest() is None
     assert comm.rank > 0 or "step-00000001.h5: was made by another version" in caplog.text
+
+
+@pytest.mark.mpi(1, 2)
+def test_other_names_are_no_checkpoints(comm, tmp_path):
+    directory = fill(comm, tmp_path, [1])
+    if comm.rank == 0:
+        shutil.copy(directory.path / "step-00000001.h5", directory.path / "step-00000010-backup")
+        for name in ("step-00000011.h5", "step-00000012-backup", "step-last"):
+            (directory.path / name).mkdir()
+        assert checkpoints_in(directory.path) == [(1, "settings")]
+    comm.Barrier()
+    assert directory.newest().content["step"] == 1
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("name, rank", [("step-00000002.h5", 0), ("frames-00000000.h5", 0),
+                                        ("step-00000002.h5", -1), ("frames-00000000.h5", -1)])
+def test_what_the_system_refuses_to_read_is_kept(comm, tmp_path, monkeypatch, name, rank):
+    """It may be sound. All ranks raise, also if only the last one cannot read the file."""
+    directory = fill(comm, tmp_path, [1])
+    frames = directory.path / "frames-00000000.h5"
+    if comm.rank == 0:
+        frames.write_bytes(b"frames" * 1000)
+    add_checksums(comm, frames)
+    directory.write(2, arrays(comm, 2)[0], [frames.name])
+    before = sorted(directory.path.iterdir())
+    comm.Barrier()
+    opened = checksums._opened
+
+    def refuse(path):
+        if comm.rank == rank % comm.size and Path(path).name == name:
+            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+        return opened(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checksums, "_opened", refuse)
+        with pytest.raises(ProductError, match=f"{name}: cannot be read: Too many open files; check"):
+            directory.newest()
+        if comm.rank == 0 == rank and name.startswith("step"):
+            with pytest.raises(ProductError, match=f"{name}: cannot be read: Too many"):
+                checkpoints_in(directory.path)
+    comm.Barrier()
+    assert sorted(directory.path.iterdir()) == before and directory.newest().content["step"] == 2
 
 
 def harm(path, kind, chooser):

@@ -1,6 +1,8 @@
 """Files are complete or absent: on full disks, with one writer for all ranks, and after errors."""
 
+import errno
 import os
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -8,11 +10,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from mpi4py import MPI
 
 from eddies.errors import UserError
 from eddies.io import new_files
-from eddies.io.checksums import FOOTER
-from eddies.io.errors import WriteError
+from eddies.io.checksums import FOOTER, find_damage
+from eddies.io.errors import WriteError, write_error
 from eddies.io.fields import FieldWriter
 from eddies.io.hdf5 import (append_frame, create_product, growing_dataset, in_files, open_product, write_array,
                             write_table)
@@ -166,6 +169,92 @@ def test_ranks_end_together_when_hdf5_cannot_write_their_file(tmp_path, ranks):
     assert ended.returncode == 2 and len(errors) == 1 and "bytes wanted" in errors[0]
     assert "Traceback" not in ended.stderr and "Signal" not in ended.stderr
     assert not (tmp_path / "run/ground_truth.h5").exists()
+
+
+# A write fails, and the file stays open until the process ends. Meanwhile the product is made again.
+AGAIN = """
+import resource, signal, sys
+from pathlib import Path
+import numpy as np
+from mpi4py import MPI
+from eddies.io import new_files
+from eddies.io.errors import ProductError
+from eddies.io.hdf5 import create_product, write_array
+
+def make(value):
+    with create_product(MPI.COMM_WORLD, Path(sys.argv[1]) / "kernel.h5", "kernel", {}) as file:
+        write_array(file, "values", np.full(300_000, value))
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+reserve, new_files._NewFile._reserve_until = new_files._NewFile._reserve_until, lambda *_: None
+resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, -1))
+try:
+    make(1.0)
+except ProductError:
+    assert new_files.writing_failed()
+resource.setrlimit(resource.RLIMIT_FSIZE, (-1, -1))
+new_files._NewFile._reserve_until = reserve
+make(2.0)
+print("made")
+"""
+
+
+def test_a_file_that_was_left_open_does_not_harm_the_next_one(tmp_path):
+    """HDF5 writes into the open file at the end of the process, and may crash then."""
+    ended = subprocess.run([sys.executable, "-c", AGAIN, str(tmp_path)], env=mpi_environment(1), capture_output=True,
+                           text=True, timeout=50)
+    assert ended.stdout == "made\n", ended.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["kernel.h5"]
+    assert find_damage(MPI.COMM_SELF, tmp_path / "kernel.h5") is None
+    with open_product(MPI.COMM_SELF, tmp_path / "kernel.h5", "kernel") as file:
+        assert np.all(file["values"][:] == 2.0)
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_failing_close_does_not_hide_the_error(comm, tmp_path, monkeypatch):
+    """The last rank alone meets it; all keep the file until the process ends."""
+    abandoned, close = [], new_files._NewFile.close
+
+    def failing(new):
+        close(new)
+        if comm.rank == comm.size - 1:
+            raise RuntimeError("cannot be closed")
+
+    monkeypatch.setattr(new_files, "_abandoned", abandoned)
+    with monkeypatch.context() as patch:
+        patch.setattr(new_files._NewFile, "close", failing)
+        with pytest.raises(WriteError, match="the first error"), create_product(comm, tmp_path / "a.h5", "frames", {}):
+            raise WriteError("the first error")
+    assert new_files.writing_failed() and [new.path.name for new in abandoned] == ["a.h5.partial"]
+
+
+@pytest.mark.mpi(1)
+def test_a_directory_need_not_be_forced_to_the_disk(comm, tmp_path, monkeypatch):
+    """Some file systems refuse it; then the product is complete. For the file itself it is an error."""
+    fsync = os.fsync
+
+    def refusing(kind):
+        def act(descriptor):
+            if kind(os.fstat(descriptor).st_mode):
+                raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+            fsync(descriptor)
+
+        return act
+
+    monkeypatch.setattr(os, "fsync", refusing(stat.S_ISDIR))
+    with create_product(comm, tmp_path / "a.h5", "frames", {}):
+        pass
+    assert find_damage(comm, tmp_path / "a.h5") is None
+    monkeypatch.setattr(os, "fsync", refusing(stat.S_ISREG))
+    with pytest.raises(WriteError), create_product(comm, tmp_path / "b.h5", "frames", {}):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
+
+
+def test_an_unknown_size_is_not_told(tmp_path):
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert "No space left on device: 7 bytes wanted, " in str(write_error(tmp_path / "a", full, 7))
+    assert "wanted" not in str(write_error(tmp_path / "a", full)) and " bytes free; " in str(write_error("a", full))
 
 
 def content(path):

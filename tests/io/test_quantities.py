@@ -52,8 +52,7 @@ SAME_UNITS = [
     (["statistics/kolmogorov_length^2"], ["statistics/dissipation_rate", "statistics/kolmogorov_time^3"]),
     (["statistics/taylor_scale"], ["statistics/kolmogorov_length"]),
     (["statistics/density_rms"], ["fields/filtered/density"]),
-    (["reconstructions/second^3"], ["reconstructions/third^2"]),
-    (["gradients/model/velocity_gradient^2"], ["reconstructions/second"])]
+    (["particles/tracers/velocity/value"], ["gradients/model/velocity_gradient", "particles/tracers/position/value"])]
 
 
 def test_units_are_those_of_the_equations():

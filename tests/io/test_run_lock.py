@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 
 from eddies.io import run_lock
+from eddies.io.errors import WriteError
 from eddies.io.hdf5 import create_product
 from eddies.io.run_lock import Holder, RunInUse, RunTakenOver, lock_directory, refuse_if_held
 from eddies.parallel.stop import StopRequest
@@ -80,7 +81,7 @@ def test_a_job_elsewhere_counts_for_five_minutes_after_its_last_sign(comm, tmp_p
 
 
 @pytest.mark.mpi(1)
-def test_a_machine_knows_which_of_its_processes_live(comm, tmp_path):
+def test_a_machine_knows_which_of_its_processes_live(comm, tmp_path, monkeypatch):
     """A living process holds the lock without recent signs of life. Its number may belong to another process later."""
     process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     job = replace(Holder.this_job(), job="another", pid=process.pid, born=run_lock._born(process.pid))
@@ -89,6 +90,17 @@ def test_a_machine_knows_which_of_its_processes_live(comm, tmp_path):
         refuse_if_held(comm, tmp_path)
     put(tmp_path, replace(job, born="1"))
     refuse_if_held(comm, tmp_path)
+    for hidden in (False, True):  # a process of another user, which /proc may hide
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "kill", failing(PermissionError))
+            if hidden:
+                patch.setattr(run_lock, "_born", lambda _: "")
+            put(tmp_path, job, silent=3600)
+            with pytest.raises(RunInUse):
+                refuse_if_held(comm, tmp_path)
+    put(tmp_path, replace(job, born=""))  # unknown, so that the signs of life count
+    with pytest.raises(RunInUse):
+        refuse_if_held(comm, tmp_path)
     put(tmp_path, job)
     process.kill()
     while run_lock._born(process.pid):
@@ -156,6 +168,16 @@ def test_a_job_that_slept_while_another_came_and_went_has_lost_its_directory(com
             with create_product(comm, tmp_path / "kernel.h5", "kernel", {}):
                 (tmp_path / "kernel.h5.partial").unlink()  # as the other job has
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.usefixtures("quick")
+def test_a_lock_that_cannot_be_replaced_leaves_nothing(comm, tmp_path, monkeypatch, elsewhere):
+    put(tmp_path, elsewhere, silent=1000)
+    monkeypatch.setattr(os, "replace", failing(PermissionError(13, "Permission denied")))
+    with pytest.raises(WriteError, match="Permission denied"), lock_directory(comm, tmp_path):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["LOCK"]
 
 
 @pytest.mark.mpi(1)

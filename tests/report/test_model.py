@@ -1,6 +1,8 @@
 """Training and coefficients in the section on a model."""
 
-from eddies.report.model import coefficient_metrics, training_metrics
+import numpy as np
+
+from eddies.report.model import coefficient_metrics, source_metrics, training_metrics
 from eddies.report.page import RunRecord, Section, metrics_json, render_page
 
 PHASES = [{"phase": "one step", "steps": 40, "seconds": 1.5, "error": 0.2},
@@ -19,6 +21,13 @@ def test_a_training_has_its_cost_and_error_by_phase():
 def test_weights_without_their_cost_differ_from_a_model_without_training():
     assert {(each.value, each.reason) for each in training_metrics({})} == {(None, "not stored with these weights")}
     assert [each.value for each in training_metrics({"training": []})] == [0.0, None, None]
+
+
+def test_missing_numbers_of_the_source_have_a_reason():
+    errors = {"delay": np.array([-0.1, 0.0]), "acceleration_error": np.array([0.2, 0.3])}
+    for metric in source_metrics(None, errors, None, errors):
+        assert metric.value is None
+        assert ("not stored with these weights" if "mach" in metric.key else "window below 1") in metric.reason
 
 
 def test_coefficients_are_written_as_learned_and_in_the_units_of_the_flow():

@@ -6,6 +6,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from eddies.measures import DRAWN, MEASURES, SHOWN
+from eddies.report.figures import png
 from eddies.report.variants import ErrorAgainstTime, name_points, scatter, section
 from eddies.workflows.variant_rows import BEFORE
 
@@ -57,6 +58,19 @@ def test_what_became_unstable_is_named_with_its_time():
     crosses = [line for line in axis.lines if line.get_marker() == "x"]
     assert len(crosses) == 1 and crosses[0].get_xdata() == 50.0
     assert crosses[0].get_ydata() > max(r["velocity_kl"] or 0 for r in ROWS)
+
+
+@pytest.mark.parametrize("kinds", [1, 6])
+def test_the_legend_is_within_the_figure_below_the_panels(kinds):
+    rows = [row(f"v{number}", 10.0 + number, 0.1, kind=f"a method with a long name, {number}")
+            for number in range(kinds)]
+    figure = scatter(ErrorAgainstTime([*rows, {**ROWS[3], "kind": rows[0]["kind"]}], "v0"), DRAWN)
+    png(figure)
+    (legend,), renderer = figure.legends, figure.canvas.get_renderer()
+    box = legend.get_window_extent(renderer)
+    assert len(legend.get_texts()) == kinds + 2
+    assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1 and figure.bbox.y0 <= box.y0
+    assert box.y1 <= min(axis.xaxis.label.get_window_extent(renderer).y0 for axis in figure.axes)
 
 
 def test_front_joins_what_nothing_beats():

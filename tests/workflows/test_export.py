@@ -1,5 +1,7 @@
 """The export of a run: a file for each series of its products, with the same numbers."""
 
+import logging
+
 import h5py
 import numpy as np
 import pytest
@@ -77,10 +79,12 @@ def test_particles_as_data_sets(comm, tmp_path, caplog):
     if comm.rank == 0:
         write_run(MPI.COMM_SELF, tmp_path, total=100, frames=11)
     comm.Barrier()
-    export.run(tmp_path, tmp_path / "sets", comm, "lagrangebench")
+    with caplog.at_level(logging.INFO, logger="eddies"):
+        export.run(tmp_path, tmp_path / "sets", comm, "lagrangebench")
     if comm.rank == 0:
         assert exported(tmp_path / "sets") == {"ground_truth-particles-tracers", "rollout-particles-model"}
-        assert "rollout-particles-truth is left out: has 6 frames" in caplog.text
+        assert "rollout-fields-model is left out: a data set holds particles only" in caplog.text
+        assert "rollout-particles-truth is left out: it has 6 frames" in caplog.text
         with h5py.File(tmp_path / "sets/rollout-particles-model/valid.h5") as copy, h5py.File(
                 tmp_path / "rollout.h5") as file:
             stored = file["particles/model/position/value"][5:8]

@@ -463,6 +463,26 @@ def test_a_report_can_be_stopped_before_and_after_its_figures_are_drawn(comm, tm
 
 
 @pytest.mark.mpi(1, 2)
+def test_a_report_can_be_stopped_between_two_rounds_of_pages(comm, tmp_path, monkeypatch):
+    """On one rank the rounds are: the main page; three others; the last. On two ranks the first two are one."""
+    def read_page(directory, *_, main):
+        read.append(main)
+        return report.Page(directory, {})
+
+    read = []
+    monkeypatch.setattr(report, "read_page", read_page)
+    others = dict.fromkeys("abcd", tmp_path)
+    stored = report.Run(tmp_path, None, dict.fromkeys("abcd", ()), {"": tmp_path, **others})
+    checks = 5  # after the measures of each page
+    with pytest.raises(Stopped):
+        report._make(stored, comm, comm.Split(comm.rank), StopAtStep(comm, checks))
+    assert read == ([True] if comm.rank == 0 else [False] * 3)
+    read.clear()
+    made, _ = report._make(stored, comm, comm.Split(comm.rank), StopAtStep(comm, checks + 4 - comm.size))
+    assert len(read) == len(made) and comm.allreduce(len(made)) == 5
+
+
+@pytest.mark.mpi(1, 2)
 def test_numbers_and_other_figures_do_not_depend_on_a_figure(comm, tmp_path, monkeypatch, caplog):
     from eddies.report import figures as module
     write_ground_truth(comm, tmp_path, tracers=False)

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 import eddies
+from eddies import stages
+from eddies.io.errors import ProductError
 from eddies.io.weights import load_weights
+from eddies.parallel.stop import StopRequest
 from eddies.scene.scene import load_scene
 from eddies.workflows import product_warnings, simulate
 from eddies.workflows.rollout.measured import TrueParticles, open_rollout
@@ -131,6 +134,27 @@ def test_what_cannot_be_run_is_refused_before_any_work(comm, folder, capfd, comm
     assert run_cli(*command, "--output", "out") == 2
     assert comm.rank > 0 or message in capfd.readouterr().err
     assert not (folder / "out").exists()
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("broken", [False, True])
+def test_a_file_that_hdf5_could_not_write_ends_the_job(comm, folder, monkeypatch, broken):
+    """Another error of a variant does not. The last rank alone knows it."""
+    def fail(step, *_):
+        raise ProductError(f"{step.variant}: no such reactor")
+
+    scene = load_scene("small.toml")
+    planned = [step for step in steps(scene, ("simulate",), folder / "out") if step.variant]
+    monkeypatch.setattr(stages, "run_step", fail)
+    monkeypatch.setattr(stages, "writing_failed", lambda: broken and comm.rank == comm.size - 1)
+    for step in planned:
+        step.links.clear()
+    if broken:
+        with pytest.raises(ProductError, match="learned: no such reactor"):
+            stages.run_steps(planned, comm, folder / "out", StopRequest(comm), False, False)
+    else:
+        failures = stages.run_steps(planned, comm, folder / "out", StopRequest(comm), False, False)
+        assert list(failures) == [step.variant for step in planned]
 
 
 @pytest.mark.mpi(1, timeout=300)

@@ -7,9 +7,11 @@ files of its directory, whose checksums it knows.
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import math
+import re
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,7 +26,7 @@ from mpi4py import MPI
 
 from eddies.cores import threads
 from eddies.io.checksums import find_damage, known_sums, open_to_read
-from eddies.io.errors import WriteError
+from eddies.io.errors import WriteError, unreadable
 from eddies.io.frame_segments import FrameSegments
 from eddies.io.hdf5 import in_files, write_block
 from eddies.io.new_files import HEADER_BYTES, new_file, own_part, writing
@@ -35,6 +37,7 @@ from eddies.parallel.stop import Stopped, StopRequest
 log = logging.getLogger("eddies")
 
 KEPT = 3
+NAME = re.compile(r"step-(\d{8,})(\.h5)?")
 PLAIN = "plain"  # the dataset of everything that is not an array, as JSON
 FORMAT = 10  # of the layout; others are not used. Raise it also with the format of products: frames are such.
 
@@ -119,7 +122,10 @@ class CheckpointDirectory:
 
     def newest(self) -> Checkpoint | None:
         """The newest sound checkpoint with these settings. Everything else in the directory is removed; a warning says
-        why a complete checkpoint is not used."""
+        why a complete checkpoint is not used.
+
+        Raises ProductError, and removes nothing, if the system refuses to read a file, which may be sound.
+        """
         paths = in_files(self.comm, self.path, lambda: _newest_first(self.path))
         while paths and (complaint := self._complaint(paths[0])):
             if self.comm.rank == 0:
@@ -192,24 +198,32 @@ class Guard:
 def checkpoints_in(path: Path) -> list[tuple[int, str]]:
     """Step and fingerprint of each readable checkpoint in a directory, the newest first; on one rank.
 
-    The fingerprint is "" for a checkpoint of another format.
+    The fingerprint is "" for a checkpoint of another format. Raises ProductError if the system refuses to read one.
     """
     contents = [content for each in _newest_first(path) if (content := _content(each)) is not None]
     return [(content["step"], content["fingerprint"] if content["format"] == FORMAT else "") for content in contents]
 
 
 def _newest_first(directory: Path) -> list[Path]:
-    """The checkpoints in a directory."""
-    return sorted((path for path in directory.glob("step-*") if path.suffix != ".partial"), reverse=True)
+    """The checkpoints in a directory. Up to version 1, a checkpoint was a directory."""
+    paths = directory.iterdir() if directory.is_dir() else ()
+    return sorted((path for path in paths if (name := NAME.fullmatch(path.name)) and path.is_dir() == (not name[2])),
+                  key=_step_of, reverse=True)
+
+
+def _step_of(path: Path) -> int:
+    return int(NAME.fullmatch(path.name)[1])
 
 
 def _content(path: Path) -> dict[str, Any] | None:
-    """The content of a checkpoint; None if it is damaged. Up to version 1, a checkpoint was a directory."""
-    if path.is_dir():
-        return {"step": int(path.name.removeprefix("step-")), "format": 0}
+    """The content of a checkpoint; None if it is damaged. Raises ProductError if the system refuses to read it."""
     try:
-        return Checkpoint(path).content
-    except (OSError, ValueError, KeyError, RuntimeError):  # ProductError is a RuntimeError
+        return {"step": _step_of(path), "format": 0} if path.is_dir() else Checkpoint(path).content
+    except OSError as error:
+        if error.errno not in (None, errno.ENOENT):
+            raise unreadable(path, error) from None
+        return None
+    except (ValueError, KeyError, RuntimeError):  # ProductError is a RuntimeError
         return None
 
 

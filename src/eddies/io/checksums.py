@@ -11,15 +11,15 @@ import itertools
 import os
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
 
-from eddies.io.errors import ProductError, file_errors, make_again
+from eddies.io.errors import ProductError, file_errors, make_again, unreadable
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -134,7 +134,7 @@ def find_damage(comm: MPI.Comm, path: Path, known: int | None = None) -> str | N
     """Compare a file with its checksums; collective.
 
     Returns a line with file, dataset and frame of the first damage, or None. `known` is the result of `known_sums` for
-    the expected file.
+    the expected file. Raises ProductError, on all ranks, if the system refuses to read the file, which may be sound.
     """
     from eddies.parallel.broadcast import on_all_ranks, on_first_rank
     from eddies.parallel.reduction import global_min
@@ -153,14 +153,17 @@ def find_damage(comm: MPI.Comm, path: Path, known: int | None = None) -> str | N
             wrong = (_first_wrong(descriptor, first, part, size) for first, part in _own_pieces(comm, size))
             return next((block for block in wrong if block is not None), _count_blocks(size))
 
-    try:
-        size = on_first_rank(comm, look)
-        if isinstance(size, str):
-            return size
-        block = int(global_min(comm, on_all_ranks(comm, first_wrong)))
-        return on_first_rank(comm, lambda: _damage(path, block)) if block < _count_blocks(size) else None
-    except OSError as error:
-        return f"{path}: cannot be read ({error})"
+    def reading(action: Callable[[], Any]) -> Any:
+        try:
+            return action()
+        except OSError as error:
+            raise unreadable(path, error) or ProductError(f"{path}: cannot be read ({error})") from None
+
+    size = on_first_rank(comm, lambda: reading(look))
+    if isinstance(size, str):
+        return size
+    block = int(global_min(comm, on_all_ranks(comm, lambda: reading(first_wrong), ProductError)))
+    return on_first_rank(comm, lambda: reading(lambda: _damage(path, block))) if block < _count_blocks(size) else None
 
 
 @contextmanager

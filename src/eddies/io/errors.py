@@ -43,9 +43,10 @@ def file_errors(path: Path | str, wanted: int = 0) -> Iterator[None]:
 
 
 def room(path: Path | str, wanted: int) -> str:
-    """The bytes wanted for a file and the free bytes of its file system, as text."""
+    """The bytes wanted for a file, unless unknown (0), and the free bytes of its file system, as text."""
     disk = os.statvfs(next(place for place in Path(path).absolute().parents if place.is_dir()))
-    return f"{wanted} bytes wanted, {disk.f_bavail * disk.f_frsize} free"
+    free = disk.f_bavail * disk.f_frsize
+    return f"{wanted} bytes wanted, {free} free" if wanted else f"{free} bytes free"
 
 
 def unreadable(path: Path | str, error: OSError) -> ProductError | None:

@@ -37,12 +37,12 @@ def shortcoming(trajectory: Trajectory) -> str | None:
     """Why a trajectory cannot become a data set; None if it can."""
     times = trajectory.times
     if min(split_frames(len(times))) < FRAMES_OF_A_SPLIT:
-        return f"has {len(times)} frames, too few for three parts with {FRAMES_OF_A_SPLIT} each"
+        return f"it has {len(times)} frames, too few for three parts with {FRAMES_OF_A_SPLIT} each"
     intervals = np.diff(times)
     if not np.allclose(intervals, intervals.mean(), rtol=1e-6, atol=0):
         return "its frames do not follow each other at equal intervals"
     if not np.isfinite(trajectory.read(len(times) - 1, "position")).all():
-        return "ends with positions that are not finite"
+        return "it ends with positions that are not finite"
     return None
 
 

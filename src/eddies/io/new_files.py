@@ -30,7 +30,7 @@ import math
 import os
 import resource
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -41,7 +41,7 @@ from mpi4py import MPI
 from eddies.io.checksums import add_checksums
 from eddies.io.errors import ProductError, WriteError, file_errors, room
 from eddies.io.run_lock import RunTakenOver
-from eddies.parallel.broadcast import on_all_ranks, on_first_rank
+from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank
 from eddies.parallel.stop import Stopped
 
 # Upper limits of what HDF5 writes beside the values: for a dataset, for a chunk, and when it closes a file.
@@ -99,10 +99,11 @@ def new_file(comm: MPI.Comm, path: Path, checksums: bool = True) -> Iterator[h5p
         _open.pop(new.name, None)
         if new.broken or comm.size > 1 and not isinstance(error, Stopped | WriteError | RunTakenOver):
             _abandoned.append(new)
-        else:
-            new.close()
+        elif new.try_to_close():
             with file_errors(new.path):
                 on_first_rank(comm, new.remove)
+        else:
+            _abandoned.append(new)
         raise
     with file_errors(path):
         on_first_rank(comm, lambda: new.publish(path))
@@ -188,7 +189,8 @@ def frame_bytes(dataset: h5py.Dataset) -> int:
 
 
 class _NewFile:
-    """An HDF5 file that all ranks write together. `reserve` and `close` are collective; rank 0 calls the others."""
+    """An HDF5 file that all ranks write together. `reserve` and both ways to close are collective; rank 0 calls the
+    others."""
 
     def __init__(self, comm: MPI.Comm, path: Path) -> None:
         self.comm, self.path, self.broken = comm, path, False
@@ -214,6 +216,16 @@ class _NewFile:
         if self._stream is not None:
             self._stream.close()
 
+    def try_to_close(self) -> bool:
+        """Close the file after an error, which stays the one that is raised. Returns whether all ranks could."""
+        complaint = None
+        try:
+            self.close()
+        except (OSError, RuntimeError) as error:
+            complaint = str(error)
+        self.broken = first_complaint(self.comm, complaint) is not None
+        return not self.broken
+
     def is_own(self) -> bool:
         """Whether the file is still the one that this job created."""
         return self.path.exists() and self.path.stat().st_ino == self._inode
@@ -228,7 +240,8 @@ class _NewFile:
         if not self.is_own():
             raise RunTakenOver(path)
         os.replace(self.path, path)
-        _force_to_disk(path.parent)
+        with suppress(OSError):  # the file is complete; some file systems refuse this for a directory
+            _force_to_disk(path.parent)
 
     def _make_empty(self) -> None:
         """Write an empty HDF5 file on rank 0. Without it, HDF5 could not even close the file on a full disk."""
@@ -236,6 +249,8 @@ class _NewFile:
             empty = io.BytesIO()
             h5py.File(empty, "w").close()
             try:
+                # A new inode: another job, or a file that was left open after an error, may have this one open.
+                self.path.unlink(missing_ok=True)
                 self.path.write_bytes(empty.getvalue())
             except OSError:
                 self.path.unlink(missing_ok=True)

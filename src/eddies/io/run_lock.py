@@ -57,7 +57,7 @@ class Holder:
     host: str
     machine: str  # the boot of the machine and the process namespace; empty if unknown
     pid: int
-    born: str  # start time of the process, in units of its machine
+    born: str  # start time of the process, in units of its machine; empty if unknown
     batch: str  # number of the Slurm job, or empty
     restarts: int  # how often Slurm has queued this job again
     start: str  # when the job took the directory, UTC
@@ -73,14 +73,22 @@ class Holder:
     def lives(self) -> bool | None:
         """Whether the job still runs; None if this machine cannot know.
 
-        The machine on which the job runs can always know. A requeued Slurm job knows that its earlier run has ended.
+        The machine on which the job runs can know. A requeued Slurm job knows that its earlier run has ended.
         """
         own = self.this_job()
         if self.batch and self.batch == own.batch and self.restarts < own.restarts:
             return False
         if not self.machine or self.machine != own.machine:
             return None
-        return _born(self.pid) == self.born  # its number may belong to another process by now
+        born = _born(self.pid)
+        try:
+            os.kill(self.pid, 0)
+        except ProcessLookupError:
+            return False
+        except PermissionError:  # a process of another user, which /proc may hide
+            if not born:
+                return True
+        return born == self.born if self.born else None  # its number may belong to another process by now
 
     def __str__(self) -> str:
         return f"process {self.pid} on {self.host}, since {self.start}"
@@ -206,7 +214,10 @@ def _take(directory: Path, take_over: bool) -> RunLock:
         # Of several jobs that replace a stale lock at the same time, the last one holds the directory.
         own = directory / f"{LOCK}.{holder.job}"
         _write(own, holder)
-        os.replace(own, path)
+        try:
+            os.replace(own, path)
+        finally:
+            own.unlink(missing_ok=True)
         time.sleep(SETTLE_SECONDS)
     if not _is_held_by(path, holder):
         _refuse(directory, find_lock(directory))
@@ -261,7 +272,7 @@ def _machine() -> str:
 
 
 def _born(pid: int) -> str:
-    """Start time of a process of this machine; empty if it has ended."""
+    """Start time of a process of this machine; empty if it has ended, or is unknown."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:

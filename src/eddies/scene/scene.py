@@ -119,12 +119,6 @@ class Scene(Section):
         return Path("runs") / self.name
 
     @property
-    def step_file(self) -> Path | None:
-        """The file of a converged step from another run; None where none is named."""
-        named = self.simulation and self.simulation.step_from
-        return Path(named) / STAGES["find-step"].file if named else None
-
-    @property
     def window(self) -> float:
         """Fraction of the ground truth that training may use. Without [training] it is the default of that section."""
         return self.training.window if self.training else DEFAULT_WINDOW

@@ -373,6 +373,11 @@ class Simulation(Section):
         return self.step == CONVERGED and self.step_from is None
 
     @property
+    def step_file(self) -> Path | None:
+        """The file of the step that `step_from` names; None without the key."""
+        return None if self.step_from is None else product_file(self.step_from, "find-step")
+
+    @property
     def confirming_files(self) -> tuple[Path, ...]:
         """The files of `confirmed_on`; none without the key."""
         return tuple(product_file(path, "dns") for path in self.confirmed_on or ())

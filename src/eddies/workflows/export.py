@@ -74,9 +74,10 @@ def _rollout(run_directory: Path, alone: Comm) -> Iterator[tuple[Series, Provena
 def _write(output: Path, case: str, group: str, series: Any, provenance: Provenance, data_set: bool) -> bool:
     """Write a series as a VTKHDF file, or particles as a data set; returns whether it was written."""
     if not len(series.times):
-        log.info("export: %s is left out: has no frames", case)
+        log.info("export: %s is left out: it has no frames", case)
         return False
     if data_set and group == "fields":
+        log.info("export: %s is left out: a data set holds particles only", case)
         return False
     if data_set and (problem := shortcoming(series)):
         log.warning("export: %s is left out: %s", case, problem)

@@ -381,17 +381,19 @@ at_least, at_most = partial(two_digits, math.ceil), partial(two_digits, math.flo
 # ---- problems that show during the run
 
 
-def check_span(time: Time, span: float, bound: float, tracers: Tracers | None = None) -> None:
-    """Raise SceneError for a flow at rest, or if a time `span` has too many steps or too many frames of `tracers`.
+def check_span(scene: Scene, span: float, bound: float, frames: bool = False) -> None:
+    """Raise SceneError for a flow at rest, or if a time `span` has too many steps or, with `frames`, too many frames.
 
     `bound` is the longest step that the present flow allows. A flow at rest has an infinite `span`.
     """
     if span == math.inf:
-        raise SceneError("the flow is at rest and has no turnover time; start from another flow")
+        raise SceneError(f"{scene.name}: the flow is at rest, so that it never turns over; set another [initial] kind "
+                         "or amplitude")
+    time = scene.time
     key = "step" if time.step else "max_step" if bound >= time.max_step else "courant"
     for problem in [*_too_many_steps(time, key, time.step or min(bound, time.max_step), span),
-                    *(_too_many_frames(tracers, span) if tracers is not None else ())]:
-        raise SceneError(problem)
+                    *(_too_many_frames(scene.tracers, span) if frames else ())]:
+        raise SceneError(f"{scene.name}: {problem}")
 
 
 def check_ground_truth(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path) -> None:

@@ -53,6 +53,7 @@ KINDS = "ground_truth", "kernel", "model", "step", "rollout"  # products, in the
 ROLLOUT_COST = {"seconds_per_step": "rollout: seconds of a step (median, without storing)",
                 "particles": "particles of the rollout",
                 "ranks": "ranks of the rollout"}
+MAIN_PAGE = 3  # time of the main page, and of a round of pages, in those of another page
 Row = dict[str, Any]
 
 
@@ -156,7 +157,6 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: S
     alone = comm.Split(comm.rank)
     try:
         made, rows = _make(stored, comm, alone, stop)
-        stop.check()
         own = [page for page in made.values() if page.directory != directory]
         on_all_ranks(comm, lambda: in_files(alone, directory, lambda: [
             _write(page, page.directory, stored.links(page.directory)) for page in own]), ProductError)
@@ -180,11 +180,11 @@ def _make(stored: Run, comm: Comm, alone: Comm, stop: StopRequest,
           draw: bool = True) -> tuple[dict[str, Page], dict[str, Row]]:
     """Make the pages and the rows of all variants. Return the pages that this rank made, and all rows.
 
-    All ranks measure each rollout together, for the rank that makes its page and its row. Raises Stopped, between
-    rollouts, when `stop` asks for it.
+    All ranks measure each rollout together, for the rank that makes its page and its row. They make the pages in
+    rounds. Raises Stopped, after a variant's rollouts are measured or after a round, when `stop` asks for it.
     """
     names = list(stored.pages) + [name for name in stored.places if name not in stored.pages]
-    makers, made, rows, truths, scanned = _makers(names, comm.size), {}, {}, {}, {}
+    (makers, rounds), made, rows, truths, scanned = _makers(names, comm.size), {}, {}, {}, {}
     with ExitStack() as files:
         measured: dict[str, list[MeasuredRollout]] = {name: [] for name in names}
         for name in names:
@@ -206,19 +206,28 @@ def _make(stored: Run, comm: Comm, alone: Comm, stop: StopRequest,
                 places = stored.places[name]
                 realised = [numbers(each) for each in measured[name]] if len(measured[name]) == len(places) else []
                 rows[name] = row(stored.scene, name, places, realised, alone)
+            for each in measured[name]:
+                each.forget()
 
-        on_all_ranks(comm, lambda: [in_files(alone, stored.directory, lambda: make(name))
-                                    for name in names if makers[name] == comm.rank], ProductError)
+        for turn in range(max(rounds.values()) + 1):
+            own = [name for name in names if (makers[name], rounds[name]) == (comm.rank, turn)]
+            on_all_ranks(comm, lambda: [in_files(alone, stored.directory, lambda: make(name)) for name in own],
+                         ProductError)
+            stop.check()
     return made, {name: found for part in comm.allgather(rows) for name, found in part.items()}
 
 
-def _makers(names: Sequence[str], ranks: int) -> dict[str, int]:
-    """Return the rank that makes each page. The main page, the first, takes about as long as three others."""
-    found, load = {}, [0] * ranks
+def _makers(names: Sequence[str], ranks: int) -> tuple[dict[str, int], dict[str, int]]:
+    """Return the rank that makes each page, and the round in which it does.
+
+    The main page, the first, takes about as long as three others. So does a round.
+    """
+    makers, rounds, load = {}, {}, [0] * ranks
     for number, name in enumerate(names):
-        found[name] = load.index(min(load))
-        load[found[name]] += 1 if number else 3
-    return found
+        rank = makers[name] = load.index(min(load))
+        rounds[name] = load[rank] // MAIN_PAGE
+        load[rank] += 1 if number else MAIN_PAGE
+    return makers, rounds
 
 
 def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, scanned: dict[Path, str],

@@ -30,7 +30,7 @@ def run(directory: Path, comm: Comm, verify: bool = False) -> None:
     """Print a line for each stage of a run, or of all runs in a directory; all ranks call it.
 
     With `verify` the ranks also compare all bytes of the products with their checksums, and print a line for each
-    product. Raises UserError if one is damaged.
+    product. Raises UserError if one is damaged or cannot be read.
     """
     for line in in_files(comm, directory, lambda: list(status_lines(directory))):
         _print(comm, line)
@@ -39,12 +39,21 @@ def run(directory: Path, comm: Comm, verify: bool = False) -> None:
     products, damaged = in_files(comm, directory, lambda: products_in(directory)), 0
     for path in products:
         old = on_first_rank(comm, lambda: before_checksums(path))
-        complaint = None if old else find_damage(comm, path)
+        complaint = None if old else _complaint(comm, path)
         damaged += complaint is not None
-        _print(comm, f"{complaint}; {make_again(path.stem)}" if complaint else
+        _print(comm, complaint or
                f"{path}: {'holds no checksums, made by an earlier version' if old else 'as written'}")
     if damaged:
-        raise UserError(f"{directory}: {damaged} of {len(products)} products are damaged")
+        raise UserError(f"{directory}: {damaged} of {len(products)} products are damaged or cannot be read")
+
+
+def _complaint(comm: Comm, path: Path) -> str | None:
+    """A line, with the remedy, on a product that is damaged or cannot be read; None if it is sound; collective."""
+    try:
+        damage = find_damage(comm, path)
+    except ProductError as error:
+        return str(error)
+    return damage and f"{damage}; {make_again(path.stem)}"
 
 
 def products_in(directory: Path) -> list[Path]:
@@ -116,9 +125,12 @@ def stage_state(name: str, step: Step) -> str:
     """The state of a stage of a step in words."""
     stage, scene = STAGES[name], step.scene
     product = step.directory / stage.file
-    checkpoints = checkpoints_in(step.directory / stage.checkpoints) if stage.checkpoints else []
     if product_fingerprint(product) == stage_fingerprint(scene, name):
         return f"complete, {in_units(product.stat().st_size)}"
+    try:
+        checkpoints = checkpoints_in(step.directory / stage.checkpoints) if stage.checkpoints else []
+    except ProductError as error:
+        return str(error)
     if checkpoints:
         fits = stage_fingerprint(scene, name) in [fingerprint for _, fingerprint in checkpoints]
         return f"stopped at step {checkpoints[0][0]}, {'can continue' if fits else 'with other settings'}"

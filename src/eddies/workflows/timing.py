@@ -18,7 +18,7 @@ from eddies.clock import WARM_UP_STEPS, duration
 from eddies.errors import UserError
 from eddies.io.hdf5 import in_files
 from eddies.io.provenance import product_attributes
-from eddies.io.new_files import write_files
+from eddies.io.new_files import write_files, writing_failed
 from eddies.learning.optimization import Adam
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import Stopped, StopRequest
@@ -90,11 +90,13 @@ def measure_stages(scene: Scene, directory: Path, stop: StepTimes) -> None:
 
 def measured(name: str, measure: Callable[[], tuple[float, float, int | None]]) -> bool:
     """Log the wall time of a stage, its seconds a step and its steps, as `measure` returns them; False where it
-    fails."""
+    fails. An error with which HDF5 could not write a file is raised, because the job must then be aborted."""
     try:
         with quiet():
             seconds, step, number = measure()
     except UserError as error:
+        if writing_failed():
+            raise
         log.info("%-28s  not measured: %s", name, error)
         return False
     if number is None:

@@ -51,9 +51,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         data, tests = training_data(definition, settings, trained_on), evaluation_frames(truth)
         model, dtype = data[0].model, data[0].dtype
         for each in data:
-            log.info("train: %d parameters; trains on frames up to %d, the next %d are for validation; the training "
-                     "window ends at t = %.3g of %.3g", sum(p.numel() for p in model.parameters()), each.learned,
-                     each.last - each.learned, each.truth.times[each.last], each.truth.times[-1])
+            log.info("train: %d parameters; trains on frames up to %d; the next %d, up to the end of the training "
+                     "window at t = %.3g of %.3g, are for validation", sum(p.numel() for p in model.parameters()),
+                     each.learned, each.last - each.learned, each.truth.times[each.last], each.truth.times[-1])
         own = next((each.model for each in data if each.truth is truth), None)
         # Where only other ground truths are trained on, no part of the run's own is seen.
         last = last_seen(settings.window if own is not None else 0.0, len(truth.times))

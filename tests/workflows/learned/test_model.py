@@ -68,7 +68,7 @@ def test_weights_of_another_model_are_refused(comm, tmp_path):
     for change in (lambda weights: {**weights, "terms.damping.rates": weights["terms.damping.rates"][:3]},
                    lambda weights: {name.replace("factor", "strength"): each for name, each in weights.items()}):
         of, _, path = saved(comm, tmp_path, change=change)
-        with pytest.raises(ProductError, match="model.h5: .*other parameters.* `eddies train`"):
+        with pytest.raises(ProductError, match="model.h5: .*parameters do not fit.* `eddies train`"):
             load_model(of, comm, path, SCALES)
     _, _, path = saved(comm, tmp_path)
     with pytest.raises(ProductError, match=r"model.h5: .*\[model.pairs\] hidden = \[4\], .* \[5\]"):

@@ -240,7 +240,7 @@ REFUSED = {
                    "holds no density"),
     "other frames": ([], halve_times, "its frames are 0.01 apart"),
     "fewer particles": (["tracers.particles_per_side=7", "training.batch=300"], None, "holds 216 particles"),
-    "too short": (["training.window=0.05", "simulation.start=0.5"], None, "[training] window = 0.05: holds 1 frames"),
+    "too short": (["training.window=0.05", "simulation.start=0.5"], None, "[training] window = 0.05: holds 2 frames"),
     "no tracers": ([], lambda file: file["particles"].pop("tracers"), "holds no tracers"),
 }
 

@@ -76,7 +76,10 @@ def test_ranks_that_share_the_work_find_what_one_finds(comm, directory):
     alone, root = comm.Split(comm.rank), comm.size - 1
     with open_rollout(directory, alone) as measured:
         measured.measure(comm, root)
-        found = values_of(measured.rollout) if comm.rank == root else None
+        found = values_of(measured.rollout)
+        assert bool(found) == (comm.rank == root), "the other ranks keep nothing"
+        measured.forget()
+        assert not values_of(measured.rollout)
     comm.Barrier()
     if comm.rank == root:
         with open_rollout(directory, alone) as lazy:

@@ -122,6 +122,10 @@ def test_checkpoints_of_another_format_and_unreadable_products_are_not_replaced(
     with monkeypatch.context() as patch, pytest.raises(ProductError, match="ground_truth.h5: cannot be read: Input"):
         patch.setattr(checksums, "_opened", refuse)
         find_work(scene.stages, scene, tmp_path)
+    save(comm, tmp_path, scene, "dns", 5)
+    with monkeypatch.context() as patch, pytest.raises(ProductError, match="step-00000005.h5: cannot be read: Input"):
+        patch.setattr(checksums, "_opened", refuse)
+        find_work(["dns"], scene, tmp_path)
     (tmp_path / "ground_truth.h5").write_bytes(b"damaged")
     with pytest.raises(WorkAtStake, match=r"ground_truth.h5 \(damaged"):
         find_work(["dns"], scene, tmp_path).refuse_to_lose()

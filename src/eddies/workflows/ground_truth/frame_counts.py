@@ -41,7 +41,7 @@ def last_trained_on(settings: Training, frames: int) -> int:
     held_out = max(math.ceil(HELD_OUT * last), longest, 2)  # rates need a frame on both sides
     if last - held_out - longest < 2:
         raise SceneError(
-            f"[training] window = {settings.window:g}: holds {last} frames of the ground truth, too few "
+            f"[training] window = {settings.window:g}: holds {last + 1} frames of the ground truth, too few "
             f"with {held_out} held out for validation and horizons of {longest}; raise it or [tracers] "
             "turnovers, or lower [tracers] frame_interval or [training.horizons] frames")
     return last - held_out

@@ -150,7 +150,8 @@ class MeasuredRollout:
 
         page: measure what a page shows, otherwise only what `accuracy` needs. every_frame: for a main page, measure the
         velocity gradient at all common frames and spectra at several. known: measures of true tracers from earlier
-        calls, which are used and added to. ProductError on all ranks if one of them cannot read a frame.
+        calls, which are used and added to. Other ranks than `root` keep no measures but those in `known`. ProductError
+        on all ranks if one of them cannot read a frame.
         """
         if self._solver is None:
             return
@@ -167,12 +168,21 @@ class MeasuredRollout:
             if task[1] == "truth":
                 known[self._key(task)] = own.get(task)
         own |= {task: known[self._key(task)] for task in tasks if known.get(self._key(task)) is not None}
-        for part in comm.gather(own, root) or []:
+        parts = comm.gather(own, root)
+        if parts is None:
+            self.forget()
+        for part in parts or []:
             for (quantity, of, frame), value in part.items():
                 getattr(self.rollout, quantity)[of][frame] = value
         complaints = [words for some in comm.allgather(self._solver.complaints) for words in some]
         if complaints and comm.rank == 0:
             log.info("report: %s", complaints[0] + (f" ({len(complaints)} such solves)" if complaints[1:] else ""))
+
+    def forget(self) -> None:
+        """Free all measures; one that is used again is made again."""
+        for measures in (self.rollout.spectra, self.rollout.invariants, self.rollout.planes):
+            for of_frames in (measures or {}).values():
+                of_frames.clear()
 
     def _tasks(self, page: bool, every_frame: bool) -> list[Task]:
         """List the measures to make; empty if nothing is compared."""

@@ -25,7 +25,8 @@ def stage_fingerprint(scene: Scene, stage: str) -> str:
     settings: dict[str, Any] = asdict(scene) | {
         "window": scene.window, "start": _digest(scene.initial.path),
         "weights": _digest(scene.model.weights_file if scene.model else None),
-        "truths": _fingerprints(training.truth_files if training else ()), "found_step": _digest(scene.step_file),
+        "truths": _fingerprints(training.truth_files if training else ()),
+        "found_step": _digest(simulation.step_file if simulation else None),
         "confirming": _fingerprints(simulation.confirming_files if simulation else ())}
     # The content of these files counts, not their paths.
     if settings["weights"] is not None:

@@ -57,7 +57,7 @@ class Work:
 def find_work(stages: Sequence[str], scene: Scene, directory: Path) -> Work:
     """The work that stages of a scene find in a locked run directory; on one rank.
 
-    Raises ProductError if the system refuses to read a product, which may be sound.
+    Raises ProductError if the system refuses to read a product or a checkpoint, which may be sound.
     """
     done, begun, useless, lost, changes = set(), set(), set(), [], {}
     seconds = stage_seconds(directory)
@@ -89,7 +89,7 @@ def step_path(settings: Simulation, directory: Path) -> Path | None:
     a number."""
     if settings.step != CONVERGED:
         return None
-    return Path(settings.step_from or directory) / STAGES["find-step"].file
+    return settings.step_file or directory / STAGES["find-step"].file
 
 
 def read_found_step(path: Path, comm: Comm) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
