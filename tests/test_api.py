@@ -63,7 +63,7 @@ def test_some_stages_and_mistakes(comm, tmp_path):
     assert (tmp_path / "ground_truth.h5").exists() and not (tmp_path / "report").exists()
     with pytest.raises(eddies.UserError, match='"dsn"'):
         eddies.run(scene, stages=["dsn"], output=tmp_path, comm=comm)
-    with pytest.raises(eddies.SceneError, match=r"has no \[model\]"):
+    with pytest.raises(eddies.SceneError, match=r"needs the section \[model\]"):
         eddies.train("abc", output=tmp_path, comm=comm)
 
 

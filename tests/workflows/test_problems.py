@@ -246,7 +246,8 @@ def test_a_run_of_given_time_has_a_limit_of_steps(comm, tmp_path, capfd):
     fast = ["--set", "initial.kind=tests.workflows.test_problems:fast", "--set", "time.duration=1e9", "--unset",
             "time.step"]
     assert eddies("dns", "abc", *fast, "--output", tmp_path) == 2
-    assert "[time] courant = " in (errors := capfd.readouterr().err) and "for a time of 1e+09, and 1e+09" in errors
+    errors = capfd.readouterr().err
+    assert "[time] courant = " in errors and "for a time of 1e+09, more than" in errors
 
 
 def fast(grid, initial, seed):
