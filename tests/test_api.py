@@ -85,3 +85,16 @@ def test_an_error_that_one_rank_meets_ends_the_job(tmp_path):
                        "import eddies.workflows.check\neddies.workflows.check.run = fail\neddies.check('abc')\n")
     code, _, errors = start(2, program)
     assert code != 0 and "RuntimeError: lost" in errors
+
+
+def test_a_file_that_hdf5_could_not_write_ends_the_job_of_several_ranks(tmp_path):
+    """All ranks meet the error; one rank goes on."""
+    from tests.test_cli import start
+    program = tmp_path / "program.py"
+    program.write_text("import eddies, eddies.io.new_files, eddies.workflows.check\n"
+                       "def fail(scene, comm):\n    raise eddies.UserError('full')\n"
+                       "eddies.workflows.check.run, eddies.io.new_files.writing_failed = fail, lambda: True\n"
+                       "try:\n    eddies.check('abc')\nexcept eddies.UserError:\n    print('goes on')\n")
+    for ranks in (1, 2):
+        code, output, errors = start(ranks, program)
+        assert (code == 0) == ("goes on" in output) == (ranks == 1), errors

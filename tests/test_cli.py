@@ -74,7 +74,7 @@ def test_bad_scene_file_ends_with_2(comm, tmp_path, capfd):
 @pytest.mark.parametrize("arguments, message", [
     (["train-kernel", TINY], "ground_truth.h5: no such file; run `eddies dns SCENE` first"),
     (["simulate", TINY], "ground_truth.h5: no such file; run `eddies dns SCENE` first"),
-    (["train", "abc"], "has no [model]"),
+    (["train", "abc"], "needs the section [model]"),
     (["report"], "no such directory")], ids=["no input", "no inputs", "no section", "no directory"])
 def test_a_command_that_cannot_work_writes_nothing(comm, tmp_path, capfd, arguments, message):
     place = [tmp_path / "run"] if arguments == ["report"] else ["--output", tmp_path / "run"]
