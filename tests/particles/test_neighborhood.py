@@ -21,7 +21,8 @@ def particles_at(comm, heights):
 @pytest.mark.mpi(2, 3)
 @pytest.mark.parametrize("strayed, refused", [(0.29, False), (0.35, True)])
 def test_particles_that_enter_a_slab_from_both_sides_must_not_meet(comm, strayed, refused):
-    """The ranks of two such particles do not exchange them. At 0.35 they are within the cutoff, but form no pair."""
+    """Ranks do not exchange these two strayed particles. At 0.35 they are within the cutoff, so their pair would be
+    missing."""
     slab = SlabDecomposition(comm, LENGTH, 24)
     cutoff = LENGTH / comm.size - 0.6
     heights = [slab.upper + strayed] if comm.rank == 0 else []

@@ -250,7 +250,7 @@ def test_unfit_truths_are_refused_before_any_work(comm, tmp_path):
     made(comm, tmp_path)
 
     def problem_with(scene, *others):
-        """What is said of another ground truth; the run itself makes its own, which is named too."""
+        """The problem with another ground truth. The run makes its own, which [training] truths names too."""
         own = tmp_path / "new"
         scene = trained_on(scene, own, *others)
         refused, _ = problems(scene, Context(comm, ("train",), own))
