@@ -21,8 +21,8 @@ RECENT = 1000                # latest steps, whose median the progress line give
 class Clock:
     """Counts steps and simulated time, up to `end` or until it is stopped."""
 
-    def __init__(self, end: float = math.inf, time: float = 0.0) -> None:
-        self.end, self.time, self.steps = end, time, 0
+    def __init__(self, end: float = math.inf) -> None:
+        self.end, self.time, self.steps = end, 0.0, 0
 
     @property
     def remaining(self) -> float:

@@ -89,9 +89,9 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
             look_at_work(step, comm, overwrite)  # a command that is refused must not end another job
     else:
         refuse_if_held(comm, directory)
-    making = {(stage, step.directory) for step in planned for stage in step.stages}
+    made = {step.directory / STAGES[stage].file for step in planned for stage in step.stages}
     for step in planned:
-        check_inputs(step, comm, making)
+        check_inputs(step, comm, made)
     if on_first_rank(comm, lambda: os.path.exists(directory / "STOP")):  # ends a chain of jobs that queues itself again
         raise SceneError(f"{directory / 'STOP'}: asks the job to stop before it begins; remove the file to continue")
     with working_in(comm, directory, stop, take_over):
@@ -212,18 +212,18 @@ def check_sections(stages: Sequence[str], scene: Scene) -> None:
                              "missing; add it")
 
 
-def check_inputs(step: Step, comm: Comm, making: Collection[tuple[str, Path]] = ()) -> None:
+def check_inputs(step: Step, comm: Comm, made: Collection[Path] = ()) -> None:
     """Raise SceneError or ProductError if an input of a step is missing, unfit or of other settings.
 
-    Inputs in `making`, by stage and directory, are not checked, because the same job makes them first.
+    Files that are `made` first by the same job are not checked.
     """
     stages, scene = step.stages, step.scene
     weights = scene.model.weights_file if "train" in stages and scene.model is not None else None
-    if weights is not None and ("train", weights.parent) not in making:
+    if weights is not None and weights not in made:
         read_source(scene, comm)
     for needed in scene.inputs(stages[0]):
         holder = step.holder(needed.name)
-        if (needed.name, holder) in making:
+        if holder / needed.file in made:
             continue
         with open_product(comm, holder / needed.file, needed.product):
             pass

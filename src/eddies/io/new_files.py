@@ -196,7 +196,7 @@ class _NewFile:
         self.comm, self.path, self.broken = comm, path, False
         self._needed, self._reserved = 0, 0
         self._alike(self._make_empty)
-        self._alike(self._open)
+        self._alike(self._open_file)
         self._inode = path.stat().st_ino if comm.rank == 0 else 0
         self.name = self.file.filename
         _open[self.name] = self
@@ -256,7 +256,7 @@ class _NewFile:
                 self.path.unlink(missing_ok=True)
                 raise
 
-    def _open(self) -> None:
+    def _open_file(self) -> None:
         self._stream: BinaryIO | None = None
         if self.comm.size > 1 and not has_single_writer(self.comm):
             self.file = h5py.File(self.path, "r+", driver="mpio", comm=self.comm)
@@ -282,7 +282,7 @@ class _NewFile:
     def _alike(self, work: Callable[[], None]) -> None:
         """Do work that may fail on some ranks. All ranks raise the WriteError of the lowest of them."""
         def guarded() -> None:
-            with file_errors(self.path, max(self._needed + 2 * MARGIN_BYTES - self._reserved, 0)):
+            with file_errors(self.path, self._needed + 2 * MARGIN_BYTES - self._reserved):
                 work()
 
         on_all_ranks(self.comm, guarded, WriteError)

@@ -224,7 +224,7 @@ def _take(directory: Path, take_over: bool) -> RunLock:
         raise RunInUse(f"{directory}: another job has just been here; run the command again")
     if found is not None:
         log.warning("%s: takes over from a job that %s (%s)", directory,
-                    "has ended" if found.stale and found.holder.lives() is False else
+                    "has ended" if found.holder.lives() is False else
                     "has given no sign of life" if found.stale else "may still work there", found.holder)
     return RunLock(directory, holder, made)
 

@@ -40,10 +40,12 @@ class PairSum:
     width : largest number of values held for a pair at once; it determines how many pairs are taken together.
     mutual : whether j gets from i what i gets from j times `parity`. Each pair is then evaluated once.
     parity : (components,), 1 or -1.
+    needs_moments : whether a term uses `context.moments` with its sums.
     """
 
     width = 8
     mutual = False
+    needs_moments = False
     parity: Tensor = torch.ones(1)
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
@@ -168,7 +170,7 @@ class Context:
 
     def sum_pairs(self, terms: Sequence[PairSum]) -> None:
         """Compute the sums of terms together, with the moments if a term needs them; collective."""
-        needs_moments = any(getattr(term, "needs_moments", False) for term in terms)
+        needs_moments = any(term.needs_moments for term in terms)
         summands = [each for each in (*terms, *([_MOMENTS] if needs_moments else [])) if each not in self._sums]
         if not summands:
             return

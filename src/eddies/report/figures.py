@@ -115,10 +115,10 @@ def _power_of_ten(value: float, position: int | None) -> str:
     return "10" + str(round(np.log10(value))).translate(SUPERSCRIPTS)
 
 
-def largest(*arrays: np.ndarray, quantile: float = 0.998) -> float:
+def largest(*arrays: np.ndarray) -> float:
     """Return a colour limit for all these arrays: a high quantile of their magnitude, never zero."""
     values = np.abs(np.concatenate([np.ravel(array) for array in arrays]))
-    return float(np.quantile(values, quantile)) or 1.0
+    return float(np.quantile(values, 0.998)) or 1.0
 
 
 def draw_pdfs(axis: Axes, truth: np.ndarray, model: np.ndarray, edges: np.ndarray) -> None:

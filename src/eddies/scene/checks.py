@@ -162,8 +162,8 @@ def check_density(flow: Flow, model: Model | None, simulation: Simulation | None
     incompressible, rates = not flow.compressible, {"density", "density_rate"}
     remedy = 'or set [flow] fluid = "compressible" and sound_speed'
     settings = model.settings if model else {}
-    reads, gives = (model.reads, model.gives) if model else ({"density"}, rates)
-    if settings and rates <= gives:
+    reads, gives = (model.reads, model.gives) if model else (set(), set())
+    if rates <= gives:
         first, second = (next(name for name, one in settings.items() if kind in one.gives)
                          for kind in ("density", "density_rate"))
         yield "model.terms", (f'"{first}" gives the density and "{second}" its rate, which are two densities; remove '

@@ -36,6 +36,7 @@ from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
 from eddies.scene.integrators import MOST_COURANT, SCHEMES
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError, Simulation
+from eddies.time_stepping import ETDRK4
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.method import METHODS, Method, TimeStep, make_method
 from eddies.workflows.run_directory.fingerprints import stage_provenance
@@ -237,7 +238,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
 def integrators(settings: Simulation, span: float) -> Iterator[tuple[str, float, int]]:
     """The integrators to search, each with its longest step in a time `span` and its evaluations in a step."""
     if settings.on_grid:
-        yield "etdrk4", MOST_COURANT, 4
+        yield "etdrk4", MOST_COURANT, ETDRK4.evaluations
         return
     # A method of the user ignores the integrator.
     for name in settings.schemes if settings.method in METHODS else settings.schemes[:1]:

@@ -233,7 +233,7 @@ def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str
         if "dns" in stages and scene.initial.flow.from_file:
             with stored_states(scene.initial, comm):
                 pass
-        weights = model.weights_file if model is not None and model.path is not None else None
+        weights = model.weights_file if model is not None else None
         if weights is not None and weights not in made and on_first_rank(comm, weights.is_file):
             from eddies.workflows.learned.source import read_source  # imports torch
             read_source(scene, comm)

@@ -53,7 +53,7 @@ KINDS = "ground_truth", "kernel", "model", "step", "rollout"  # products, in the
 ROLLOUT_COST = {"seconds_per_step": "rollout: seconds of a step (median, without storing)",
                 "particles": "particles of the rollout",
                 "ranks": "ranks of the rollout"}
-MAIN_PAGE = 3  # time of the main page, and of a round of pages, in those of another page
+MAIN_PAGE = 3  # the main page takes as long as this many other pages; so does a round of pages
 Row = dict[str, Any]
 
 
@@ -240,12 +240,12 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
     page = Page(directory, read_stage_seconds(directory))
     readers = {
         "ground_truth": _ground_truth_sections,
-        "kernel": lambda file, page: [kernel.section(read_json(file, "description")["support"], **{
+        "kernel": lambda file: [kernel.section(read_json(file, "description")["support"], **{
             name: read_table(file, name) for name in ("kernels", "slices", "errors")})],
-        "model": lambda file, page: [_model_section(file, page, main)],
-        "step": lambda file, page: [steps.section(read_attributes(file, "found"), {
+        "model": lambda file: [_model_section(file, page, main)],
+        "step": lambda file: [steps.section(read_attributes(file, "found"), {
             name: read_table(file, f"trials/{name}") for name in file["trials"]})],
-        "rollout": lambda file, page: _rollout_sections(measured.rollout, page, main)}
+        "rollout": lambda file: _rollout_sections(measured.rollout, page, main)}
     for kind in KINDS:
         path = directory / f"{kind}.h5"
         if not path.exists():
@@ -261,7 +261,7 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
                 with contextlib.suppress(ProductError):  # its section says so
                     page.stationary = read_stationary_span(file)
             if main or not path.is_symlink():
-                page.sections += _sections_or_notice(kind, page, lambda: readers[kind](file, page))
+                page.sections += _sections_or_notice(kind, page, lambda: readers[kind](file))
     if not page.provenance:
         raise ProductError(f"{directory}: holds none of {', '.join(f'{kind}.h5' for kind in KINDS)}; "
                            "run `eddies dns SCENE` first")
@@ -296,7 +296,7 @@ def read_stationary_span(file: File) -> StationarySpan:
         raise ProductError(f"{file.filename}: {error}; raise [spin_up] stationary and run `eddies dns` again") from None
 
 
-def _ground_truth_sections(file: File, page: Page) -> list[Section]:
+def _ground_truth_sections(file: File) -> list[Section]:
     reference, statistics = read_attributes(file, "reference"), read_table(file, "statistics")
     traced = "released_at" in reference
     name = "filtered" if traced else "final"

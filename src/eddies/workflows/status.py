@@ -12,7 +12,7 @@ from eddies.io.checkpoint import checkpoints_in
 from eddies.io.checksums import ATTRIBUTE, find_damage, open_to_read
 from eddies.io.errors import ProductError, make_again
 from eddies.io.hdf5 import in_files
-from eddies.io.provenance import product_fingerprint, product_provenance
+from eddies.io.provenance import product_provenance
 from eddies.io.run_lock import find_lock
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
@@ -125,17 +125,17 @@ def stage_state(name: str, step: Step) -> str:
     """The state of a stage of a step in words."""
     stage, scene = STAGES[name], step.scene
     product = step.directory / stage.file
-    if product_fingerprint(product) == stage_fingerprint(scene, name):
+    settings, origin = stage_fingerprint(scene, name), product_provenance(product)
+    if origin.get("fingerprint") == settings:
         return f"complete, {in_units(product.stat().st_size)}"
     try:
         checkpoints = checkpoints_in(step.directory / stage.checkpoints) if stage.checkpoints else []
     except ProductError as error:
         return str(error)
     if checkpoints:
-        fits = stage_fingerprint(scene, name) in [fingerprint for _, fingerprint in checkpoints]
+        fits = settings in [fingerprint for _, fingerprint in checkpoints]
         return f"stopped at step {checkpoints[0][0]}, {'can continue' if fits else 'with other settings'}"
     if product.is_file():
-        origin = product_provenance(product)
         if not origin:
             return "damaged, unfinished or of another version"
         return "made with " + of_other_settings(changed_settings(stage, origin.get("scene"), scene.to_toml()))

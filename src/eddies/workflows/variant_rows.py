@@ -17,7 +17,7 @@ from eddies.io.provenance import environment, read_json
 from eddies.measures import MEASURES, finite
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES
-from eddies.scene.scene import Eulerian, Scene
+from eddies.scene.scene import Scene
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import FAILURE, read_found_step, step_path
 from eddies.workflows.variants import Place
@@ -126,8 +126,7 @@ def notes(scene: Scene) -> list[str]:
         blank = " and ".join(MEASURES[measure] for measure in THROUGH_KERNEL)
         found.append(f"{', '.join(own)}: no {blank}. These numbers need the smoothing kernel, and a kernel with other "
                      "settings than the scene's would give values that cannot be compared.")
-    grids = {name: (variant.eulerian or Eulerian()).cells_for(variant.tracers.filter_width)
-             for name, variant in variants.items() if variant.simulation.on_grid}
+    grids = {name: variant.coarse_cells for name, variant in variants.items() if variant.coarse_cells}
     if grids:
         kept = ", ".join(f"{(cells - 1) // 3} in {name}" for name, cells in grids.items())
         found.append(f"Largest wavenumber |k_i| that a grid keeps by the 2/3 rule: {kept}; k_d = "

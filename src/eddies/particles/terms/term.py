@@ -61,13 +61,11 @@ class Term(nn.Module, TermBase):
 
 
 class PairTerm(Term, PairSum):
-    """A term that is a sum over pairs; see PairSum. `needs_moments` tells whether `rates_of` uses `context.moments`.
+    """A term that is a sum over pairs; see PairSum.
 
     The sums of several such terms are taken together over the same pairs. If terms give a density that others read,
     there are two such passes. The rates belong to the requested particles, in training some of the owned ones.
     """
-
-    needs_moments = False
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """Contribution from the sums (components, k) over each particle's neighbours."""

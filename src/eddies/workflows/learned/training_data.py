@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -101,13 +100,10 @@ class TrainingData:
         return load_frame(self.truth, index, self.model, self.dtype, self.settings.wants_fields)
 
     def _window(self, start: int, resolution: ResolvedVelocity | None) -> TrainingWindow:
-        columns = {name: torch.from_numpy(column).to(self.truth.device)
-                   for name, column in self.truth.window(start, self.longest).items()}
-        later = {name: columns.pop(f"{name}_later").movedim(1, 0).contiguous()
+        columns, device = self.truth.window(start, self.longest), self.truth.device
+        later = {name: torch.from_numpy(columns[f"{name}_later"]).to(device).movedim(1, 0).contiguous()
                  for name in ("position", "velocity", "density") if f"{name}_later" in columns}
-        particles = ParticleSet(**columns)
-        if not self.model.integrates_density:
-            particles = replace(particles, density=None)
+        particles = particles_for(self.model, columns, device)
         # Stored positions are wrapped into the box; these continue from the positions of the first frame.
         position = particles.position + PeriodicBox(BOX_LENGTH).displacement(later["position"], particles.position)
         moments = [particles, *(ParticleSet(particles.id, *moved) for moved in zip(position, later["velocity"]))]
