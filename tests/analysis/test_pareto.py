@@ -33,6 +33,7 @@ def test_a_method_is_worth_its_cost_where_no_cheaper_one_is_as_accurate():
     assert "early error; late error" in worth and "error" not in not_worth
     worth, not_worth = verdict_on(row("learned", 2, None, None))
     assert "error" not in worth and "no number for early error; late error" in not_worth
+    assert verdict_on(row("learned", 4, 0.3, 0.1))[0].endswith("in no measure.")  # the grid has equal cost and errors
     assert len(verdict_on(row("learned", 2, 0.1, 0.2), [])) == 1
 
 

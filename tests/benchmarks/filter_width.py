@@ -22,7 +22,7 @@ from eddies.report.figures import DNS, FILTERED, FOURTH, MODEL, SECOND, THIRD, T
 
 DRAWN = ("velocity_error_half", "acceleration_kl")
 # Label, colour and marker of the variants.
-LOOKS = {"learned": ("the resolved velocity", MODEL, "o"), "with-pairs": ("and pairs", SECOND, "^"),
+LOOKS = {"resolved": ("the resolved velocity", MODEL, "o"), "with-pairs": ("and pairs", SECOND, "^"),
          "grid": ("best grid of its cost", TRUTH, "s"), "paper": ("the paper's form", THIRD, "D"),
          "transport-velocity": ("transport-velocity SPH", FOURTH, "v"),
          "local": ("all among neighbours", FILTERED, "P"), "no-force": ("no force", DNS, "x")}
@@ -39,7 +39,7 @@ def best_grid(rows: Mapping[str, Row], measure: str) -> Row | None:
     """The coarse grid with the smallest error of those that take no longer than the learned model."""
     rivals = [row for row in rows.values() if row["method"] == "eulerian"
               and None not in (row[measure], row["wall_seconds"])
-              and row["wall_seconds"] <= rows["learned"]["wall_seconds"]]
+              and row["wall_seconds"] <= rows["resolved"]["wall_seconds"]]
     return min(rivals, key=lambda row: row[measure], default=None)
 
 
@@ -67,7 +67,7 @@ def drawn(results: Sequence[Mapping[str, Any]]) -> Figure:
             axis.errorbar(width, error, [[min(s, 0.9 * e) for s, e in zip(spread, error)], spread], color=colour,
                           marker=marker, markersize=6, capsize=2, elinewidth=1, label=words)
         if f"{measure}_floor" in MEASURES:
-            width, floor, *_ = zip(*points(results, "learned", f"{measure}_floor"))
+            width, floor, *_ = zip(*points(results, "resolved", f"{measure}_floor"))
             axis.plot(width, floor, color=FILTERED, linestyle=":", label="two samples of the truth")
         axis.set(xscale="log", yscale="log", xlabel=r"width of the filter $d/\eta$",
                  ylabel=in_symbols(MEASURES[measure]))
@@ -82,6 +82,9 @@ def drawn(results: Sequence[Mapping[str, Any]]) -> Figure:
 if __name__ == "__main__":
     *sources, target = map(Path, sys.argv[1:])
     given = [json.loads(source.read_text()) for source in sources]
+    for result in given:
+        for row in result["rows"]:
+            row["name"] = {"learned": "resolved"}.get(row["name"], row["name"])  # its name in version 1.0
     for each in DRAWN:
         print(each, *(f"d/eta {at:.1f}: {name} {error:.3g}" for at, error, _, name in points(given, "grid", each)))
     target.write_bytes(png(drawn(given)))

@@ -45,7 +45,8 @@ def datasets(comm, path):
     with h5py.File(path) as file:
         file.visititems(lambda name, item: found.update({name: item[()]} if isinstance(item, h5py.Dataset) else {}))
     comm.Barrier()
-    assert np.all(np.diff(found.pop("history/seconds", [0.0, 1.0])) > 0)
+    seconds = found.pop("history/seconds", None)
+    assert path.name == "kernel.h5" if seconds is None else np.all(np.diff(seconds) > 0)
     return found
 
 
