@@ -17,4 +17,4 @@ def one_model(name: str, overrides: Sequence[str] = (), removals: Sequence[str] 
 def problems_of(scene: Scene, comm) -> tuple[list[str], list[str]]:
     """Refusals and warnings of all stages of a scene."""
     from eddies.workflows.problems import here, problems
-    return problems(scene, here(scene, comm))
+    return problems(scene, here(scene.stages_of_all, scene.directory, comm))

@@ -34,7 +34,7 @@ from eddies.workflows.learned.source import read_source
 from eddies.workflows.problems import Context, check_ground_truth, memory_of_node, problems
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 from eddies.workflows.run_directory.work import FAILURE, SECONDS, Work, find_work, stage_seconds
-from eddies.workflows.variants import Step, check_unseen, steps
+from eddies.workflows.variants import Step, steps
 
 log = logging.getLogger("eddies")
 
@@ -74,13 +74,13 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
                  "a scene, stages and a directory with the SHA-256 {}")
     warn_of_few_processors(comm)
     scene.check_variants(variants)
-    check_unseen(scene, directory)
+    scene.check_unseen(directory)
     planned, reported = steps(scene, stages, directory, variants), "report" in stages
     for step in planned:
-        check_sections(step.stages, step.scene)
+        step.scene.check_stages(step.stages)
     if not planned and not reported:
         for each in [scene.variant[name] for name in variants] or [scene]:
-            check_sections(stages, each)
+            each.check_stages(stages)
     refused, warnings = problems(scene, Context(comm, stages, directory, variants, memory_of_node(comm)))
     for problem in refused:
         raise SceneError(problem)
@@ -199,17 +199,6 @@ def run_stage(name: str, scene: Scene, comm: Comm, directory: Path, stop: StopRe
         raise
     seconds = record_seconds(name, time.perf_counter() - start, comm, directory, begun)
     log.info("%s: took %s", name, duration(seconds))
-
-
-def check_sections(stages: Sequence[str], scene: Scene) -> None:
-    """Raise SceneError if a scene lacks the section of a stage."""
-    for stage in stages:
-        if stage not in scene.stages:
-            if stage == "train" and scene.model is not None and scene.simulation is not None:
-                raise SceneError(f'{scene.name}: [simulation] method = "{scene.simulation.method}" needs no trained '
-                                 'model; set method = "learned" to train one')
-            raise SceneError(f"{scene.name}: `eddies {stage}` needs the section [{STAGES[stage].section}], which is "
-                             "missing; add it")
 
 
 def check_inputs(step: Step, comm: Comm, made: Collection[Path] = ()) -> None:

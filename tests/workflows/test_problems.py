@@ -235,7 +235,7 @@ def test_a_flow_of_unknown_turnover_time_is_refused_once_it_is_there(comm, tmp_p
                for word in ("--set", each)]
     assert eddies("dns", "tracers-only", *options, "--output", tmp_path) == 2
     errors = capfd.readouterr().err
-    assert comm.rank > 0 or errors.startswith("eddies: error: tracers-only: ") and errors.count("\n") == 1
+    assert comm.rank > 0 or errors.startswith("eddies: error: ") and errors.count("\n") == 1
     assert comm.rank > 0 or message in errors
     comm.Barrier()
     assert not (tmp_path / "ground_truth.h5").exists()

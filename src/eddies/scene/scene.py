@@ -189,6 +189,26 @@ class Scene(Section):
         for name in names:
             check_variant(name, self.variant, self.name)
 
+    def check_stages(self, stages: Sequence[str]) -> None:
+        """Raise SceneError if the section of a stage is missing."""
+        for stage in stages:
+            if stage not in self.stages:
+                if stage == "train" and self.model is not None and self.simulation is not None:
+                    raise SceneError(f'{self.name}: [simulation] method = "{self.simulation.method}" needs no trained '
+                                     'model; set method = "learned" to train one')
+                raise SceneError(f"{self.name}: `eddies {stage}` needs the section [{STAGES[stage].section}], which is "
+                                 "missing; add it")
+
+    def check_unseen(self, directory: Path) -> None:
+        """Raise SceneError if a variant is trained on one of the realisations in a run directory."""
+        for name, variant in (self.variant or {self.name: self}).items():
+            trained_on = [path.resolve() for path in variant.training.truth_files] if variant.training else []
+            for seed in self.realisations or ():
+                path = directory / f"{REALISATION}{seed}" / STAGES["dns"].file
+                if path.resolve() in trained_on:
+                    raise SceneError(f"{name}: [training] truths names {path}, which is a realisation; remove {seed} "
+                                     "from realisations")
+
     def _problems(self) -> checks.Problems:
         """Yield the problems of names, of sections side by side, and of variants, each with the key at fault."""
         flow, tracers, kernel, model, simulation = self.flow, self.tracers, self.kernel, self.model, self.simulation
@@ -208,11 +228,12 @@ class Scene(Section):
         if simulation is not None and tracers is not None:
             yield from checks.check_simulation(simulation, tracers, self.seen_in(self.directory))
         yield from checks.check_coarse_grid(self.eulerian, self.coarse_cells, flow, model)
-        for name, variant in self.variant.items():
-            yield from ((f"{VARIANT}.{name}", problem) for problem in self._problems_of_variant(name, variant))
+        for name in self.variant:
+            yield from ((f"{VARIANT}.{name}", problem) for problem in self._problems_of_variant(name))
 
-    def _problems_of_variant(self, name: str, variant: "Scene") -> Iterator[str]:
+    def _problems_of_variant(self, name: str) -> Iterator[str]:
         """Yield the problems of a variant that cannot run beside the others, or whose rollouts cannot be compared."""
+        variant = self.variant[name]
         if problem := checks.problem_of_name(name):
             yield problem
         elif not isinstance(variant, Scene) or variant.variant or variant.realisations:
@@ -250,16 +271,16 @@ class Scene(Section):
         Reading it back gives an equal scene. With `all_keys` comments list the absent keys and sections too.
         """
         lines = write_section(self, all_keys=all_keys)
-        for name, scene in self.variant.items():
-            lines += ["", f"[{VARIANT}.{name}]", *self.differences(scene)]
+        for name in self.variant:
+            lines += ["", f"[{VARIANT}.{name}]", *self.differences(name)]
         return "\n".join(lines) + "\n"
 
-    def differences(self, variant: "Scene") -> Iterator[str]:
+    def differences(self, name: str) -> Iterator[str]:
         """Yield the lines of a variant's table: the keys in which it differs, `key = value`."""
         own, other = (dict(dotted(tomllib.loads("\n".join(write_section(scene)))))
-                      for scene in (self.without_variants, variant))
-        for name in set(OF_THE_WHOLE) & {*own, *other}:
-            own.pop(name, None), other.pop(name, None)
+                      for scene in (self.without_variants, self.variant[name]))
+        for key in set(OF_THE_WHOLE) & {*own, *other}:
+            own.pop(key, None), other.pop(key, None)
         held = Layer(other).keys
         removed = dict.fromkeys(next(part for part in with_sections(key) if part not in held)
                                 for key in own if key not in held)

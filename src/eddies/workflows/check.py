@@ -46,7 +46,8 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
     """Return all estimates by the keys that docs/check.md describes, None if unknown; all ranks call it."""
     expected, tracers, k_max = estimate(scene), scene.tracers, scene.flow.largest_wavenumber
     rollout_of = {name: estimate(each).rollout for name, each in (scene.variant or {scene.name: scene}).items()}
-    (refusals, warnings), limits, work = problems(scene, here(scene, comm)), most_ranks(scene), work_of(scene)
+    context = here(scene.stages_of_all, scene.directory, comm)
+    (refusals, warnings), limits, work = problems(scene, context), most_ranks(scene), work_of(scene)
     turbulence = expected.turbulence
     costs = [cost(variant, stage, scenes, comm.size) for (variant, stage), scenes in work.items()]
     return {

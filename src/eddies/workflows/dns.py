@@ -56,12 +56,12 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         if saved is None:
             flow.history.sample(flow.state, flow.clock)
         if flow.phase == "spin-up":
-            spin_up(flow, scene.spin_up.turnovers, partial(check_span, scene))
+            spin_up(flow, scene.spin_up.turnovers, partial(check_span, scene.time))
         if scene.tracers is not None:
             if flow.phase != "tracers":
                 saved = None
                 span = scene.tracers.turnovers * flow.history.sample(flow.state, flow.clock)["eddy_turnover_time"]
-                check_span(scene, span, flow.step_limit.bound(flow.state, flow.clock), frames=True)
+                check_span(scene.time, span, flow.step_limit.bound(flow.state, flow.clock), scene.tracers)
             layout = frame_layout(scene.tracers, fluid.compressible, fluid.grid.cutoff)
             with FrameSegments(comm, guard.checkpoints.path, layout, saved.files if saved is not None else ()) as parts:
                 whole = partial(whole_frames, scene.simulation, scene.training, scene.tracers.field_every)
@@ -73,7 +73,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 write_attributes(file.create_group("forcing"), asdict(scene.forcing))
             tracers.write_spectra(file)
         else:
-            run_for(flow, scene.time.duration, partial(check_span, scene))
+            run_for(flow, scene.time.duration, partial(check_span, scene.time))
             write_final_fields(file, flow)
             scales = scales_of(flow.history.sample(flow.state, flow.clock))
         write_attributes(file.create_group("reference"), {

@@ -62,11 +62,11 @@ class Context:
     free_disk: float = math.inf
 
 
-def here(scene: Scene, comm: Comm) -> Context:
-    """Return the context of all stages of a scene in its own run directory on this machine; all ranks call it."""
-    place = next(path for path in (scene.directory, *scene.directory.parents) if path.is_dir())
+def here(stages: Sequence[str], directory: Path, comm: Comm) -> Context:
+    """Return the context of stages in a run directory on this machine; all ranks call it."""
+    place = next(path for path in (directory, *directory.parents) if path.is_dir())
     free = on_first_rank(comm, lambda: shutil.disk_usage(place).free)
-    return Context(comm, scene.stages_of_all, scene.directory, memory=memory_of_node(comm), free_disk=free)
+    return Context(comm, stages, directory, memory=memory_of_node(comm), free_disk=free)
 
 
 def memory_of_node(comm: Comm) -> float:
@@ -381,19 +381,17 @@ at_least, at_most = partial(two_digits, math.ceil), partial(two_digits, math.flo
 # ---- problems that show during the run
 
 
-def check_span(scene: Scene, span: float, bound: float, frames: bool = False) -> None:
-    """Raise SceneError for a flow at rest, or if a time `span` has too many steps or, with `frames`, too many frames.
+def check_span(time: Time, span: float, bound: float, tracers: Tracers | None = None) -> None:
+    """Raise SceneError for a flow at rest, or if a time `span` has too many steps or, with `tracers`, too many frames.
 
     `bound` is the longest step that the present flow allows. A flow at rest has an infinite `span`.
     """
     if span == math.inf:
-        raise SceneError(f"{scene.name}: the flow is at rest, so that it never turns over; set another [initial] kind "
-                         "or amplitude")
-    time = scene.time
+        raise SceneError("the flow is at rest, so that it never turns over; set another [initial] kind or amplitude")
     key = "step" if time.step else "max_step" if bound >= time.max_step else "courant"
     for problem in [*_too_many_steps(time, key, time.step or min(bound, time.max_step), span),
-                    *(_too_many_frames(scene.tracers, span) if frames else ())]:
-        raise SceneError(f"{scene.name}: {problem}")
+                    *(_too_many_frames(tracers, span) if tracers else ())]:
+        raise SceneError(problem)
 
 
 def check_ground_truth(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path) -> None:

@@ -399,7 +399,8 @@ def _write_main(stored: Run, page: Page, rows: Mapping[str, Row], comm: Comm) ->
         beside = {output / "variants.csv": lines.getvalue(),
                   output / "variants.json": json.dumps(record, indent=2, allow_nan=False) + "\n"}
     page.seconds = {**read_stage_seconds(stored.directory), **page.seconds}
-    _write(page, stored.directory, stored.links(stored.directory), beside, scene)
+    text = scene.to_toml() if scene is not None and scene.variant else None
+    _write(page, stored.directory, stored.links(stored.directory), beside, text)
     for section in page.sections:
         count = len(section.illustrations)
         log.info("report: %s%s", section.title, f" ({count} figure{'s' if count > 1 else ''})" if count else "")
@@ -413,8 +414,9 @@ def _write_main(stored: Run, page: Page, rows: Mapping[str, Row], comm: Comm) ->
 
 
 def _write(page: Page, directory: Path, links: Sequence[tuple[str, str]], beside: Mapping[Path, str] | None = None,
-           scene: Scene | None = None) -> None:
-    """Write a page and its numbers below a run directory. `scene` is the whole scene, if the page is about it."""
+           scene: str | None = None) -> None:
+    """Write a page and its numbers below a run directory. `scene` is the text of the scene if it has variants and the
+    page is about all of them."""
     rows = [("stage", "ranks", "wall time (s)", "date", "eddies", "commit", "libraries")]
     for kind, origin in page.provenance.items():
         stage = MAKER_OF[kind].name
@@ -422,7 +424,7 @@ def _write(page: Page, directory: Path, links: Sequence[tuple[str, str]], beside
                      shown(page.seconds[stage]) if stage in page.seconds else "not stored", origin["date"],
                      origin["eddies"], origin["commit"][:12] if origin["commit"] else "not a checkout",
                      ", ".join(f"{name} {version}" for name, version in origin["libraries"].items())))
-    text = scene.to_toml() if scene is not None and scene.variant else list(page.provenance.values())[-1]["scene"]
+    text = scene or list(page.provenance.values())[-1]["scene"]
     title = tomllib.loads(text).get("title", "untitled scene")
     write_page(directory / "report", RunRecord(directory.resolve().name, title, text, rows, page.warnings, links),
                page.sections, page.images, beside or {})

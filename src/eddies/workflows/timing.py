@@ -14,6 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from eddies.clock import WARM_UP_STEPS, duration
 from eddies.errors import UserError
 from eddies.io.hdf5 import in_files
@@ -24,7 +26,7 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import Stopped, StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
-from eddies.scene.scene import Scene
+from eddies.scene.scene import Scene, Training
 from eddies.workflows import dns, find_step, report, simulate, train, train_kernel
 from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.ground_truth.frame_counts import TESTED_FRAMES
@@ -61,31 +63,27 @@ def run(scene: Scene, comm: Comm, signals: Sequence[int] = ()) -> None:
     stop = StepTimes(comm, signals)
     log.info("%s: measured on %d %s", scene.name, comm.size, "rank" if comm.size == 1 else "ranks")
     log.info("%-28s  s a step     steps  wall time", "stage")
+    few, failed = shortened(scene, None), set()
     try:
         with temporary_directory(comm) as directory:
-            measure_stages(scene, directory, stop)
+            if scene.tracers:  # a single interval of frames tells how fast the flow turns over
+                with quiet():
+                    dns.run(few.without_variants, comm, directory, stop)
+                reference = product_attributes(directory / STAGES["dns"].file, "reference")
+                few = shortened(scene, reference["eddy_turnover_time"])
+            for step in steps(few, scene.stages_of_all, directory):
+                whole = scene.variant[step.variant] if step.variant else scene.without_variants
+                in_files(comm, step.directory, step.link)
+                for stage in step.stages:
+                    name = f"{step.variant}: {stage}" if step.variant else stage
+                    measure = partial(wall_time_of, stage, step.scene, whole, step.directory, stop)
+                    if step.variant not in failed and not measured(name, measure):
+                        failed.add(step.variant)
+            if "report" in scene.stages_of_all:
+                in_files(comm, directory, lambda: write_files({directory / "scene.toml": few.to_toml()}))
+                measured("report", partial(wall_time_of, "report", few, scene, directory, stop))
     except Stopped:
         raise Stopped(stop.reason, "from the beginning") from None
-
-
-def measure_stages(scene: Scene, directory: Path, stop: StepTimes) -> None:
-    """Measure the stages of a scene and of its variants one after the other in a directory."""
-    comm, few, failed = stop.comm, shortened(scene, None), set()
-    if scene.tracers:  # a single interval of frames tells how fast the flow turns over
-        with quiet():
-            dns.run(few.without_variants, comm, directory, stop)
-        few = shortened(scene, product_attributes(directory / STAGES["dns"].file, "reference")["eddy_turnover_time"])
-    for step in steps(few, scene.stages_of_all, directory):
-        whole = scene.variant[step.variant] if step.variant else scene.without_variants
-        in_files(comm, step.directory, step.link)
-        for stage in step.stages:
-            name = f"{step.variant}: {stage}" if step.variant else stage
-            measure = partial(wall_time_of, stage, step.scene, whole, step.directory, stop)
-            if step.variant not in failed and not measured(name, measure):
-                failed.add(step.variant)
-    if "report" in scene.stages_of_all:
-        in_files(comm, directory, lambda: write_files({directory / "scene.toml": few.to_toml()}))
-        measured("report", partial(wall_time_of, "report", few, scene, directory, stop))
 
 
 def measured(name: str, measure: Callable[[], tuple[float, float, int | None]]) -> bool:
@@ -120,7 +118,11 @@ def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
                                              velocity_kl_weight=0.0, acceleration_kl_weight=0.0))
     seconds = elapsed(comm, lambda: RUN[stage](once, comm, directory, stop))
     if stage == "train":
-        return rest_of_training(seconds, few, whole, directory, stop)
+        if whole.model.path is not None:
+            return seconds, 0.0, 0
+        definition, device = ModelDefinition.of(few), prepare_torch(whole.device, comm)
+        rest, number, step = rest_of_training(definition, few.training, whole.training.frames, directory, device, stop)
+        return seconds + rest, step, number
     if stage == "report":
         return seconds, 0.0, 0
     if stage == "find-step":  # here its rollouts are one interval long
@@ -138,23 +140,20 @@ def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
     return seconds + max((number or 0) - taken, 0) * step, step, number
 
 
-def rest_of_training(seconds: float, few: Scene, whole: Scene, directory: Path,
-                     stop: StopRequest) -> tuple[float, float, int | None]:
-    """Wall time, seconds of a mean step and number of steps of the training of the model.
+def rest_of_training(definition: ModelDefinition, few: Training, frames: int, directory: Path, device: torch.device,
+                     stop: StopRequest) -> tuple[float, int, float]:
+    """What a run with one step and `few` frames lacks: all `frames`, and the steps and validations of each phase.
 
-    It adds to the `seconds` of a run with one step and few frames those of all frames, and of the steps and validations
-    of each phase.
+    Returns its wall time, the number of steps, and the seconds of a mean step.
     """
-    if whole.model.path is not None:
-        return seconds, 0.0, 0
-    comm, stepping, number = stop.comm, 0.0, 0
-    with open_truths(directory / STAGES["dns"].file, few.training.truth_files, few.tracers, comm,
-                     prepare_torch(whole.device, comm)) as (_, trained_on):
-        kernel = load_kernel(comm, directory / STAGES["train-kernel"].file) if few.training.field_weight > 0 else None
-        data = training_data(ModelDefinition.of(few), few.training, trained_on)
+    comm, seconds, stepping, number = stop.comm, 0.0, 0.0, 0
+    with open_truths(directory / STAGES["dns"].file, few.truth_files, definition.tracers, comm, device) as (
+            _, trained_on):
+        kernel = load_kernel(comm, directory / STAGES["train-kernel"].file) if few.field_weight > 0 else None
+        data = training_data(definition, few, trained_on)
         parameters = list(data[0].model.parameters())
-        frames = elapsed(comm, lambda: [each.frames for each in data]) / few.training.frames
-        seconds += frames * (whole.training.frames - few.training.frames + TESTED_FRAMES)
+        each_frame = elapsed(comm, lambda: [each.frames for each in data]) / few.frames
+        seconds += each_frame * (frames - few.frames + TESTED_FRAMES)
         for phase in [*one_step_phases(data, kernel), *horizon_phases(data)] if parameters else ():
             stop.check()
             optimizer = Adam(comm, parameters, phase.steps, *phase.rates)
@@ -162,7 +161,7 @@ def rest_of_training(seconds: float, few: Scene, whole: Scene, directory: Path,
                        for index in range(min(2 * FEW, phase.steps)))
             stepping, number = stepping + phase.steps * step, number + phase.steps
             seconds += (phase.steps // phase.validate_every + 1) * elapsed(comm, phase.validate)
-    return seconds + stepping, stepping / max(number, 1), number
+    return seconds + stepping, number, stepping / max(number, 1)
 
 
 def shortened(scene: Scene, turnover: float | None) -> Scene:

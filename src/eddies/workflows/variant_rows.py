@@ -48,7 +48,7 @@ def row(scene: Scene, name: str, places: Sequence[Place], realised: Sequence[Map
     found: dict[str, Any] = dict.fromkeys(COLUMNS)
     found |= {"name": name, "label": variant.label or name, "method": variant.simulation.method,
               "kind": variant.simulation.title, "on_grid": variant.simulation.on_grid,
-              "settings": "; ".join(scene.differences(variant)) if scene.variant else ""}
+              "settings": "; ".join(scene.differences(name)) if scene.variant else ""}
     if realised:
         found |= together(realised)
         found |= before(places[0], alone)

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from eddies.io.provenance import product_fingerprint
 from eddies.pipeline import STAGES
-from eddies.scene.scene import REALISATION, Scene, SceneError
+from eddies.scene.scene import REALISATION, Scene
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 
 # Stages whose products variants share if their settings agree.
@@ -142,14 +142,3 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
         if working:
             found.append(Step(own, tuple(working), where, name, links))
     return found
-
-
-def check_unseen(scene: Scene, directory: Path) -> None:
-    """Raise SceneError if a variant is trained on one of the realisations."""
-    for name, variant in (scene.variant or {scene.name: scene}).items():
-        trained_on = [path.resolve() for path in variant.training.truth_files] if variant.training else []
-        for seed in scene.realisations or ():
-            path = directory / f"{REALISATION}{seed}" / STAGES["dns"].file
-            if path.resolve() in trained_on:
-                raise SceneError(f"{name}: [training] truths names {path}, which is a realisation; remove {seed} "
-                                 "from realisations")
