@@ -3,8 +3,9 @@
 Supported layouts of other codes, with arrays [z, y, x] and points from the corner of the cube on:
 
 - cutouts of the Johns Hopkins Turbulence Databases (JHTDB), as pyJHTDB, giverny and givernylocal write them:
-  `Velocity_0001`, ... (z, y, x, component), numbered in time, and the points of each axis in `xcoor`, `ycoor` and
-  `zcoor`, of a cube of edge 2 pi. The points show whether the cutout is the whole cube.
+  `Velocity_0001` or `velocity_0001`, ... (z, y, x, component), numbered in time, and the points of each axis in
+  `xcoor`, `ycoor` and `zcoor`, of a cube of edge 2 pi. The points show whether the cutout is the whole cube. The value
+  -999.9 marks points that the database did not deliver.
 - files `state_phys*.h5` and `.nc` of fluidsim: `state_phys/vx`, `vy` and `vz` (z, y, x) and the attributes `Lx`, `Ly`,
   `Lz` of `info_simul/params/oper`.
 """
@@ -23,14 +24,22 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.io.checksums import open_to_read
-from eddies.io.errors import ProductError
+from eddies.io.errors import ProductError, unreadable
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import open_product
 from eddies.io.provenance import read_provenance
 from eddies.parallel.broadcast import on_all_ranks, on_first_rank
+from eddies.parallel.reduction import global_max, global_min, global_sum
 
 CUTOUT_EDGE = 2 * math.pi
-CUTOUT_NAME = re.compile(r"Velocity_(\d+)")
+CUTOUT_NAME = re.compile(r"[Vv]elocity_(\d+)")
+NOT_DELIVERED = -999.9, 9.969209968386869e36  # of JHTDB; default of netCDF for values that were never written
+LARGEST_VELOCITY = 1e12  # its square, summed over a grid, fits into single precision
+FILL_ATTRIBUTES = "_FillValue", "missing_value"
+# The first bytes of files in other formats, with a remedy.
+OTHER_FORMATS = {b"CDF": "a netCDF 3 file; convert it with `nccopy -k netCDF-4 OLD NEW`",
+                 b"\x93NUMPY": "a NumPy array; store it in HDF5, or read it in a function that [initial] kind names",
+                 b"MATLAB 5": "a MATLAB file before version 7.3; save it with `-v7.3`, in one of the known layouts"}
 FLUIDSIM_PARAMETERS = "info_simul/params/oper"
 PLACE_TOLERANCE = 0.01  # of a grid step: coordinates of cutouts have single precision
 
@@ -60,6 +69,9 @@ class VelocityCubes:
         for state in states:
             shape = (self.cells,) * 3 + ((3,) if len(state) == 1 else ())
             for dataset in state:
+                if dataset.dtype.kind in "iu":
+                    raise ProductError(f"{_place(dataset)}: holds integers ({dataset.dtype}), perhaps packed with a "
+                                       "scale and an offset; store floating-point numbers, as `ncpdq -U` unpacks them")
                 if dataset.shape != shape or dataset.dtype.kind != "f" or not self.cells:
                     raise ProductError(f"{_place(dataset)}: has type {dataset.dtype} and shape {dataset.shape}; a "
                                        "velocity with the same number of points along each axis is needed")
@@ -72,14 +84,34 @@ class VelocityCubes:
         """Planes start to stop of the velocity, (3, stop - start, y, x); ProductError if they are damaged."""
         return np.concatenate([_read_planes(dataset, start, stop) for dataset in self._states[index]])
 
+    def check(self, comm: MPI.Comm, index: int, velocity: np.ndarray) -> None:
+        """Raise ProductError for a velocity that cannot be a flow; `velocity` has the planes of this rank."""
+        dataset = self._states[index][0]
+        fills = {*NOT_DELIVERED, *(float(np.ravel(dataset.attrs[name])[0]) for name in FILL_ATTRIBUTES
+                                   if np.asarray(dataset.attrs.get(name)).dtype.kind == "f")}
+        for fill in fills:
+            with np.errstate(over="ignore"):  # in half precision
+                mark = np.asarray(fill).astype(velocity.dtype)
+            if count := int(global_sum(comm, np.count_nonzero(velocity == mark))):
+                raise ProductError(f"{_place(dataset)}: {count} values are {fill:.6g}, the mark of points that were "
+                                   "not delivered or written; get the file again")
+        lowest = global_min(comm, velocity.min(axis=(1, 2, 3), initial=np.inf))
+        highest = global_max(comm, velocity.max(axis=(1, 2, 3), initial=-np.inf))
+        if (lowest == highest).all():
+            value = ", ".join(f"{component:g}" for component in lowest + 0.0)
+            raise ProductError(f"{_place(dataset)}: the velocity is {value} everywhere; a flow that varies is needed")
+        if (largest := max(-lowest.min(), highest.max())) > LARGEST_VELOCITY:
+            raise ProductError(f"{_place(dataset)}: the largest velocity is {largest:.3g}, more than the limit of "
+                               f"{LARGEST_VELOCITY:g}; get the file again, or scale it")
+
 
 @contextmanager
-def open_states(comm: MPI.Comm, path: str | Path) -> Iterator[StoredStates | VelocityCubes]:
+def open_states(comm: MPI.Comm, path: Path) -> Iterator[StoredStates | VelocityCubes]:
     """The states of the whole flow in a file; all ranks call it, and if one cannot read it, all raise ProductError.
 
     A ground truth with tracers has states at a few times, one without has its last state.
     """
-    if on_first_rank(comm, lambda: _is_product(Path(path))):
+    if on_first_rank(comm, lambda: _is_product(path)):
         with open_product(comm, path, "ground_truth") as file:
             yield StoredStates(file, "final" if "fields/final" in file else "unfiltered")
     else:
@@ -88,29 +120,37 @@ def open_states(comm: MPI.Comm, path: str | Path) -> Iterator[StoredStates | Vel
 
 
 def _is_product(path: Path) -> bool:
-    """Whether a file is a product, or unreadable, which `open_product` reports best."""
-    try:
-        with open_to_read(path) as file:
-            return "kind" in file.attrs
-    except OSError:
-        return True
+    """Whether a file is a product of this package. ProductError if it is missing or no HDF5 file."""
+    if not path.is_file():
+        raise ProductError(f"{path.absolute()}: {'is no regular file' if path.exists() else 'no such file'}; make it "
+                           "with `eddies dns SCENE`, or correct [initial] path, which is searched in the working "
+                           "directory and beside the scene")
+    with _open(path) as file:
+        return "kind" in file.attrs
 
 
-def _open(path: str | Path) -> h5py.File:
+def _open(path: Path) -> h5py.File:
     try:
         return open_to_read(path)
     except OSError as error:
-        raise ProductError(f"{path}: cannot be opened ({error}); put it where all ranks can read it") from None
+        if problem := unreadable(path, error):
+            raise problem from None
+        with open(path, "rb") as file:
+            start = file.read(max(map(len, OTHER_FORMATS)))
+        found = next((text for mark, text in OTHER_FORMATS.items() if start.startswith(mark)), None)
+        raise ProductError(f"{path}: is {found}" if found else
+                           f"{path}: is no HDF5 file, or damaged ({error}); get or make it again") from None
 
 
 def _velocity_cubes(file: h5py.File) -> VelocityCubes:
-    cutouts = {int(match[1]): file[name] for name in file if (match := CUTOUT_NAME.fullmatch(name))}
+    cutouts = {int(match[1]): name for name in file if (match := CUTOUT_NAME.fullmatch(name))}
     if cutouts:
-        return _cutouts([cutouts[number] for number in sorted(cutouts)])
-    if all(isinstance(file.get(f"state_phys/v{axis}"), h5py.Dataset) for axis in "xyz"):
+        return _cutouts([_dataset(file, cutouts[number]) for number in sorted(cutouts)])
+    state = file.get("state_phys")
+    if isinstance(state, h5py.Group) and all(f"v{axis}" in state for axis in "xyz"):
         return _fluidsim_state(file)
     raise ProductError(f"{file.filename}: holds no velocity in a known layout: of eddies (ground_truth.h5), of "
-                       "a JHTDB cutout (Velocity_0001, ...) or of fluidsim (state_phys/vx, vy, vz); it holds: "
+                       "a JHTDB cutout (velocity_0001, ...) or of fluidsim (state_phys/vx, vy, vz); it holds: "
                        f"{', '.join(file) or 'nothing'}")
 
 
@@ -119,10 +159,13 @@ def _cutouts(datasets: Sequence[h5py.Dataset]) -> VelocityCubes:
     step = CUTOUT_EDGE / cubes.cells
     for name in ("xcoor", "ycoor", "zcoor"):
         points = file.get(name)
-        if not isinstance(points, h5py.Dataset) or points.shape != (cubes.cells,):
-            raise ProductError(f"{file.filename}: holds no {name} with {cubes.cells} points, which would show "
+        if not isinstance(points, h5py.Dataset) or points.shape != (cubes.cells,) or points.dtype.kind not in "fiu":
+            raise ProductError(f"{file.filename}: holds no {name} with {cubes.cells} numbers, which would show "
                                "that the cube is whole and periodic; get the cutout with its coordinates")
         where = points[()].astype(np.float64)
+        if abs(where[-1] - where[0] - CUTOUT_EDGE) < PLACE_TOLERANCE * step:
+            raise ProductError(f"{file.filename}: {name} goes from {where[0]:.6g} to {where[-1]:.6g}, so that the last "
+                               "plane repeats the first; leave out the last plane of each axis")
         if not np.abs(where - where[0] - step * np.arange(cubes.cells)).max() < PLACE_TOLERANCE * step:
             raise ProductError(f"{file.filename}: {name} goes from {where[0]:.6g} to {where[-1]:.6g} in {len(where)} "
                                "points, which is not the whole periodic cube of edge 2 pi at equal distances; get all "
@@ -131,10 +174,11 @@ def _cutouts(datasets: Sequence[h5py.Dataset]) -> VelocityCubes:
 
 
 def _fluidsim_state(file: h5py.File) -> VelocityCubes:
-    cubes = VelocityCubes([[file[f"state_phys/v{axis}"] for axis in "xyz"]])
+    cubes = VelocityCubes([[_dataset(file, f"state_phys/v{axis}") for axis in "xyz"]])
     parameters = file.get(FLUIDSIM_PARAMETERS)
     try:
-        edges = [float(parameters.attrs[f"L{axis}"]) for axis in "xyz"]
+        # Newer versions write arrays of one element.
+        edges = [float(np.asarray(parameters.attrs[f"L{axis}"]).item()) for axis in "xyz"]
     except (AttributeError, KeyError, TypeError, ValueError):
         raise ProductError(f"{file.filename}: {FLUIDSIM_PARAMETERS} has no numbers Lx, Ly, Lz, the edges of the box; "
                            "take a file as fluidsim writes it") from None
@@ -142,6 +186,30 @@ def _fluidsim_state(file: h5py.File) -> VelocityCubes:
         raise ProductError(f"{file.filename}: the box has the edges {', '.join(f'{edge:g}' for edge in edges)}; a "
                            "cube is needed")
     return cubes
+
+
+def _dataset(file: h5py.File, name: str) -> h5py.Dataset:
+    """The dataset of a name. ProductError if it is something else, or if its values cannot be read."""
+    try:
+        item = file[name]
+    except KeyError as error:
+        raise ProductError(f"{file.filename}: {name} is a link to something that is missing ({error.args[0]}); put the "
+                           "data there, or copy them into this file") from None
+    if not isinstance(item, h5py.Dataset):
+        raise ProductError(f"{file.filename}: {name} is a {type(item).__name__.lower()}, not a dataset; get the file "
+                           "again")
+    folder = Path(file.filename).parent
+    for source in item.virtual_sources() if item.is_virtual else ():
+        if source.file_name != "." and not any((place / source.file_name).exists() for place in (folder, Path())):
+            raise ProductError(f"{_place(item)}: takes its values from {source.file_name}, which is missing; put that "
+                               "file beside this one")
+    filters = item.id.get_create_plist()
+    for code, *_, label in (filters.get_filter(number) for number in range(filters.get_nfilters())):
+        if not h5py.h5z.filter_avail(code):
+            raise ProductError(f"{_place(item)}: is compressed with {label.decode() or 'a filter'} (number {code}), "
+                               "which this HDF5 does not have; install its plugin and set HDF5_PLUGIN_PATH, or "
+                               "recompress the file with `h5repack -f GZIP=4 OLD NEW` where it can be read")
+    return item
 
 
 def _read_planes(dataset: h5py.Dataset, start: int, stop: int | None) -> np.ndarray:

@@ -7,6 +7,7 @@ set. The order is base, scene, variant, command line.
 from __future__ import annotations
 
 import copy
+import os
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from eddies.scene.values import SceneError
 BUILT_IN = Path(__file__).parents[1] / "scenes"
 VARIANT = "variant"
 OF_FILES = ("base", "unset")  # keys that only a file may have
+FILE_KEYS = {"initial": ("path",), "model": ("path",), "training": ("truths",), "simulation": ("step_from",)}
 DEEPEST = 3  # parts of a dotted key: [section.sub.key], and the same in [variant.NAME]
 
 Document = dict[str, Any]
@@ -109,6 +111,7 @@ def read_document(name_or_path: str, above: Sequence[Path] = ()) -> tuple[Path, 
     path = _find(name_or_path, above[-1].parent if above else None)
     try:
         document = _parse(path)
+        _find_files(document, path.parent)
         base = document.pop("base", None)
         if base is None:
             if "unset" in document:
@@ -148,6 +151,23 @@ def _find(name_or_path: str, beside: Path | None) -> Path:
     if is_directory:
         raise SceneError(f"{name_or_path}: is a directory, not a scene; give the path of a TOML file in it")
     raise SceneError(f"{shortened(name_or_path)}: no such scene; {nearest(name_or_path, names)}{remedy}")
+
+
+def _find_files(document: Document, folder: Path) -> None:
+    """Replace relative paths in a document, of files that exist beside the scene and not in the working directory."""
+    def found(path: str) -> str:
+        beside = os.path.abspath(folder / path)
+        return beside if not os.path.exists(path) and os.path.exists(beside) else path
+
+    for key, value in document.items():
+        if isinstance(value, dict):
+            _find_files(value, folder)
+            for name in FILE_KEYS.get(key, ()):
+                path = value.get(name)
+                if isinstance(path, str):
+                    value[name] = found(path)
+                elif isinstance(path, list):
+                    value[name] = [found(each) if isinstance(each, str) else each for each in path]
 
 
 def _parse(path: Path) -> Document:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from eddies.import_path import is_path, load
+from eddies.pipeline import STAGES
 from eddies.scene.integrators import SCHEMES, Scheme
 from eddies.scene.rules import quoted
 from eddies.scene.values import (SceneError, Section, boolean, choice, integer, integers, named, number,
@@ -89,10 +90,18 @@ class Initial(Section):
                               default=1.0, above=0)
     peak_wavenumber: float = number("wavenumber of the spectrum's peak, random only", default=3.0, above=0)
     wavenumber: int = integer("number of waves in the cube; abc, shear-wave, sound-wave only", default=1, at_least=1)
-    path: str | None = text("file to start from, on any grid: ground_truth.h5, JHTDB cutout or fluidsim state; kind "
-                            "file only", default=None)
+    path: str | None = text("file to start from, on any grid: ground_truth.h5 or its run directory, JHTDB cutout or "
+                            "fluidsim state; kind file only", default=None)
     state: int = integer("index in time of the state in this file: fields/final, with tracers fields/unfiltered, in a "
-                         "cutout Velocity_####", default=0, at_least=0)
+                         "cutout velocity_####", default=0, at_least=0)
+
+    @property
+    def file(self) -> Path | None:
+        """The file to start from; of a run directory, its ground truth."""
+        if self.path is None:
+            return None
+        path = Path(self.path).expanduser()
+        return path / STAGES["dns"].file if path.is_dir() else path
 
     @property
     def flow(self) -> InitialFlow:

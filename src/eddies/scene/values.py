@@ -248,7 +248,8 @@ def import_paths(part: Section) -> Iterator[tuple[str, str]]:
 def product_file(path: str, stage: str) -> Path:
     """Return the file of a stage's product that a key names: the path itself if it ends in .h5, else in this run
     directory."""
-    return Path(path) if path.endswith(".h5") else Path(path) / STAGES[stage].file
+    file = Path(path).expanduser()
+    return file if path.endswith(".h5") else file / STAGES[stage].file
 
 
 def place(key: str, section: str) -> str:

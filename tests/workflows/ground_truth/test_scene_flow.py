@@ -1,5 +1,8 @@
 """Flows that start from velocities in files of other codes."""
 
+import os
+from pathlib import Path
+
 import h5py
 import numpy as np
 import pytest
@@ -28,8 +31,8 @@ def stored_velocity(cells=STORED, factor=1.0):
     return velocity
 
 
-def write_cutout(path, velocities, stride=4, points=None, coordinates=("xcoor", "ycoor", "zcoor")):
-    """As pyJHTDB writes a cutout of isotropic1024coarse."""
+def write_cutout(path, velocities, stride=4, points=None, coordinates=("xcoor", "ycoor", "zcoor"), first="V"):
+    """As pyJHTDB writes a cutout of isotropic1024coarse; newer clients write names with a small first letter."""
     with h5py.File(path, "w") as file:
         cells = velocities[0].shape[-1]
         last = 1 + stride * (cells - 1)
@@ -39,7 +42,7 @@ def write_cutout(path, velocities, stride=4, points=None, coordinates=("xcoor", 
         for name in coordinates:
             file[name] = np.float32(2 * np.pi * np.arange(cells) / cells) if points is None else points
         for velocity, number in zip(velocities, (9, 2000, 10000)):  # HDF5 lists them by name
-            file[f"Velocity_{number:04d}"] = np.moveaxis(velocity, 0, -1).astype(np.float32)
+            file[f"{first}elocity_{number:04d}"] = np.moveaxis(velocity, 0, -1).astype(np.float32)
             file[f"Pressure_{number:04d}"] = np.zeros((*velocity.shape[1:], 1), np.float32)
 
 
@@ -73,15 +76,23 @@ def path(comm, tmp_path):
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("layout, tolerance", [("cutout", 1e-6), ("fluidsim", 1e-14)])
-def test_the_flow_of_the_file_is_the_flow_of_the_scene(comm, path, layout, tolerance):
-    """On another grid, for any edge of the box, and without the part that has a divergence. Cutouts are in single
-    precision."""
+@pytest.mark.parametrize("layout, tolerance", [("cutout", 1e-6), ("new cutout", 1e-6), ("fluidsim", 1e-14),
+                                               ("new fluidsim", 1e-14)])
+def test_the_flow_of_the_file_is_the_flow_of_the_scene(comm, path, caplog, layout, tolerance):
+    """On another grid, for any edge of the box, and without the part that has a divergence, whose share is logged.
+    Cutouts are in single precision. Newer versions of fluidsim write the edges as arrays of one element."""
     if comm.rank == 0:
         write = {"cutout": lambda: write_cutout(path, [stored_velocity()]),
-                 "fluidsim": lambda: write_fluidsim(path, stored_velocity())}
+                 "new cutout": lambda: write_cutout(path, [stored_velocity()], first="v"),
+                 "fluidsim": lambda: write_fluidsim(path, stored_velocity()),
+                 "new fluidsim": lambda: write_fluidsim(path, stored_velocity(), np.full((3, 1), 4.0))}
         write[layout]()
+    caplog.set_level("INFO", "eddies")
     fluid, velocity = start(comm, path)
+    # <u.u> of the flow is 0.5 + 0.125 + 0.5 + 0.045 + 0.01 + 0.245 + 0.02, that of the part 0.4^2 / 2.
+    share = 100 * 0.08 / (1.445 + 0.08)
+    assert f"{share:.3g} % of its energy" in caplog.text
+    assert comm.rank > 0 or "5 % of the energy is in a part with divergence, so it may be no" in caplog.text
     expected = flow(*fluid.grid.coordinates())
     assert np.abs(fluid.grid.backward(velocity) - expected).max(initial=0) < tolerance
     sound = ("flow.fluid=compressible", "flow.sound_speed=10")
@@ -109,6 +120,33 @@ PART = np.float32(2 * np.pi * np.arange(STORED) / 1024)
 UNEVEN = np.float32(2 * np.pi * np.arange(STORED) / STORED) + np.float32(0.1) * (np.arange(STORED) == 5)
 
 
+def changed(path, make):
+    """A cutout with something else in the place of its velocity."""
+    write_cutout(path, [stored_velocity()])
+    with h5py.File(path, "a") as file:
+        del file["Velocity_0009"]
+        made = make(file)
+        if made is not None:
+            file["Velocity_0009"] = made
+
+
+def virtual(file):
+    layout = h5py.VirtualLayout((STORED,) * 3 + (3,), "f4")
+    layout[...] = h5py.VirtualSource("none.h5", "v", layout.shape)
+    file.create_virtual_dataset("Velocity_0009", layout)
+
+
+WITH_END = np.pad(stored_velocity(), ((0, 0), *[(0, 1)] * 3), "wrap")
+UNDELIVERED = stored_velocity()
+UNDELIVERED[:, 3, 4:6, 5] = UNDELIVERED[:, 9, 4, 5] = -999.9
+VALUES = {
+    "not finite": (lambda path: write_cutout(path, [BROKEN]), "Velocity_0009: .*not finite"),
+    "one component": (lambda path: write_fluidsim(path, BROKEN), "state_phys/vy: .*not finite"),
+    "undelivered": (lambda path: write_cutout(path, [UNDELIVERED]), "9 values are -999.9, the mark of points"),
+    "zero": (lambda path: write_fluidsim(path, 0 * BROKEN.clip(-1, 1)), "velocity is 0, 0, 0 everywhere"),
+    "uniform": (lambda path: write_fluidsim(path, 0 * BROKEN.clip(-1, 1) + 2), "velocity is 2, 2, 2 everywhere"),
+    "huge": (lambda path: write_fluidsim(path, 1e30 * stored_velocity()), "largest velocity is 1.*e.30"),
+}
 REFUSED = {
     "a part": (lambda path: write_cutout(path, [stored_velocity()], points=PART), "xcoor goes from 0 to 0.0674952"),
     "uneven": (lambda path: write_cutout(path, [stored_velocity()], points=UNEVEN), "not the whole periodic cube"),
@@ -117,6 +155,17 @@ REFUSED = {
     "scalar": (lambda path: write_cutout(path, [stored_velocity()[:1]]), r"Velocity_0009: .* shape \(12, 12, 12, 1\)"),
     "no cube": (lambda path: write_fluidsim(path, stored_velocity(), (4.0, 4.0, 8.0)), "edges 4, 4, 8"),
     "no edges": (lambda path: write_fluidsim(path, stored_velocity(), ("four",) * 3), "no numbers Lx"),
+    "links": (lambda path: changed(path, lambda file: h5py.SoftLink("/none")), "Velocity_0009 is a link to something"),
+    "other file": (lambda path: changed(path, lambda file: h5py.ExternalLink("none.h5", "/v")), "none.h5"),
+    "group": (lambda path: changed(path, lambda file: file.create_group("other")), "Velocity_0009 is a group"),
+    "integers": (lambda path: changed(path, lambda file: np.ones((STORED,) * 3 + (3,), np.int16)), "int16.*packed"),
+    "sources": (lambda path: changed(path, virtual), "from none.h5, which is missing"),
+    "text": (lambda path: write_cutout(path, [stored_velocity()], points=np.full(STORED, b"a")), "no xcoor with 12"),
+    "end": (lambda path: write_cutout(path, [WITH_END], points=np.float32(2 * np.pi * np.arange(STORED + 1) / STORED)),
+            "leave out the last plane"),
+    "netCDF 3": (lambda path: Path(path).write_bytes(b"CDF\1" + bytes(60)), "is a netCDF 3 file; convert it"),
+    "array": (lambda path: np.save(open(path, "wb"), stored_velocity()), "is a NumPy array; store it in HDF5"),
+    "cut short": (lambda path: (write_fluidsim(path, stored_velocity()), os.truncate(path, 9000)), "damaged .*get or"),
     "unknown": (lambda path: write_fluidsim(path, stored_velocity()[:2]), "state_phys"),
 }
 
@@ -133,10 +182,38 @@ def test_an_unfit_file_is_refused_by_check_and_run(comm, path):
         (line,), _ = problems_of(scene, comm)
         assert line == str(error.value) and line.startswith(f"{path}: "), case
         comm.Barrier()
-    for write, place in ((lambda: write_cutout(path, [BROKEN]), "Velocity_0009"),
-                         (lambda: write_fluidsim(path, BROKEN), "state_phys/vy")):
+    for write, message in VALUES.values():
         if comm.rank == 0:
-            write()
-        with pytest.raises(UserError, match=f"{place}: .*not finite"):
+            write(path)
+        with pytest.raises(UserError, match=message):
             start(comm, path)
         comm.Barrier()
+
+
+@pytest.mark.mpi(1)
+def test_a_missing_filter_is_named(comm, path, monkeypatch):
+    write_cutout(path, [stored_velocity()])
+    changed(path, lambda file: file.create_dataset("other", data=np.zeros((STORED,) * 3 + (3,), "f4"), shuffle=True))
+    monkeypatch.setattr(h5py.h5z, "filter_avail", lambda code: False)
+    with pytest.raises(UserError, match="is compressed with shuffle .number 2.*HDF5_PLUGIN_PATH"):
+        start(comm, path)
+    (tmp := Path(path).parent / "empty").mkdir()
+    with pytest.raises(UserError, match=f"{tmp}/ground_truth.h5: no such file; make it"):
+        start(comm, tmp)
+    with pytest.raises(UserError, match="is no regular file"):
+        start(comm, "/dev/null")
+
+
+def test_files_are_searched_beside_the_scene_too(tmp_path, monkeypatch):
+    (tmp_path / "case").mkdir()
+    scene = tmp_path / "case" / "scene.toml"
+    scene.write_text('base = "taylor-green"\ninitial.kind = "file"\ninitial.path = "start.h5"\n')
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert load_scene(scene).initial.file == Path("start.h5")  # it may be made later
+    (tmp_path / "case" / "start.h5").touch()
+    assert load_scene(scene).initial.file == tmp_path / "case" / "start.h5"
+    (tmp_path / "start.h5").touch()
+    assert load_scene(scene).initial.file == Path("start.h5")
+    assert load_scene(scene, ["initial.path=~/start.h5"]).initial.file == tmp_path / "start.h5"
+    assert load_scene(scene, ["initial.path=case"]).initial.file == Path("case/ground_truth.h5")

@@ -19,10 +19,13 @@ from eddies.io.flow_states import StoredStates, VelocityCubes, open_states
 from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
+from eddies.scene.rules import quoted
 from eddies.scene.scene import BOX_LENGTH, Flow, Forcing, Initial, SceneError, Time
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 
 log = logging.getLogger("eddies")
+
+MOST_REMOVED = 0.05  # of the energy of another code's flow, in a part with divergence; more is doubtful
 
 
 def build_fluid(flow: Flow, forcing: Forcing | None, comm: Comm) -> Fluid:
@@ -76,7 +79,7 @@ def stored_states(initial: Initial, comm: Comm) -> Iterator[StoredStates | Veloc
 
     Raises SceneError if [initial] state is too large, ProductError if the file has no state.
     """
-    with open_states(comm, initial.path) as states:
+    with open_states(comm, initial.file) as states:
         if initial.state >= len(states):
             raise SceneError(f"[initial] state = {initial.state}: {initial.path} holds {len(states)} states of the "
                              f"whole flow, number 0 to {len(states) - 1}; name one of them")
@@ -93,6 +96,9 @@ def _state_from_file(initial: Initial, fluid: Fluid) -> np.ndarray:
         stored = on_all_ranks(comm, lambda: {name: fields.read(initial.state, name, *planes) for name in names},
                               ProductError)
         stored_speed = on_all_ranks(comm, lambda: fields.sound_speed, ProductError)
+        foreign = isinstance(fields, VelocityCubes)
+        if foreign:
+            fields.check(comm, initial.state, stored["velocity"])
     velocity = regrid(whole, grid, whole.forward(stored["velocity"]))
     if "density" in stored:
         density = regrid(whole, grid, whole.forward(np.log(stored["density"])))
@@ -105,7 +111,16 @@ def _state_from_file(initial: Initial, fluid: Fluid) -> np.ndarray:
                          (stored_speed / fluid.sound_speed) ** 2)
         return np.concatenate([velocity, density])
     # The velocity of a compressible flow, in single precision or on fewer points, is not exactly solenoidal.
-    velocity = grid.solenoidal(velocity)
+    solenoidal = grid.solenoidal(velocity)
+    if foreign:
+        kept, all_of_it = (grid.sum_modes(np.square(np.abs(part)).sum(axis=0)) for part in (solenoidal, velocity))
+        removed = 1 - kept / all_of_it if all_of_it else 0.0
+        log.info("dns: the velocity in %s has %.3g %% of its energy in a part with divergence, which is removed",
+                 initial.path, 100 * removed)
+        if removed > MOST_REMOVED and comm.rank == 0:
+            log.warning("[initial] path = %s: %.0f %% of the energy is in a part with divergence, so it may be no "
+                        "incompressible flow: its axes or components may be in another order than [z, y, x] and "
+                        "u, v, w, or its points too few for its smallest eddies", quoted(initial.path), 100 * removed)
     if not fluid.compressible:
-        return velocity
-    return np.concatenate([velocity, balanced_density(grid, velocity, fluid.sound_speed)[None]])
+        return solenoidal
+    return np.concatenate([solenoidal, balanced_density(grid, solenoidal, fluid.sound_speed)[None]])

@@ -23,7 +23,7 @@ def stage_fingerprint(scene: Scene, stage: str) -> str:
     """
     training, simulation = scene.training, scene.simulation
     settings: dict[str, Any] = asdict(scene) | {
-        "window": scene.window, "start": _digest(scene.initial.path),
+        "window": scene.window, "start": _digest(scene.initial.file),
         "weights": _digest(scene.model.weights_file if scene.model else None),
         "truths": _fingerprints(training.truth_files if training else ()),
         "found_step": _digest(simulation.step_file if simulation else None),
