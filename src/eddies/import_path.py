@@ -8,7 +8,9 @@ from __future__ import annotations
 import hashlib
 import inspect
 import sys
-from collections.abc import Iterable
+import traceback
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from importlib import import_module, metadata
 from pathlib import Path
 from typing import Any
@@ -56,6 +58,26 @@ def load(path: str) -> Any:
     if not hasattr(module, name):
         raise ImportPathError(f'"{path}": {module_name} has no {name}')
     return getattr(module, name)
+
+
+@contextmanager
+def users_code(called: Any, problem: type[UserError], hint: str = "") -> Iterator[None]:
+    """Convert an exception of a user's class or function into a `problem` with its name, file and line.
+
+    Errors of this package and of its own classes pass unchanged. `hint` ends the text.
+    """
+    try:
+        yield
+    except (UserError, MemoryError):
+        raise
+    except Exception as error:  # a user's code may raise anything
+        module = getattr(called, "__module__", None) or "builtins"
+        if __package__ in (module.partition(".")[0], type(error).__module__.partition(".")[0]):
+            raise
+        file = getattr(sys.modules.get(module), "__file__", None)
+        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
+        place = f"{file}, line {lines[-1]}: " if lines else ""
+        raise problem(f"{called.__qualname__}: {place}{type(error).__name__}: {error}{hint}") from error
 
 
 def origins(paths: Iterable[str]) -> dict[str, dict[str, str | None]]:

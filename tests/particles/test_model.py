@@ -10,8 +10,9 @@ from eddies.import_path import ImportPathError
 from eddies.parallel.reduction import sum_flat
 from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.rates import Rates
+from eddies.particles.terms.pair_network import build_network, outputs_of
 from eddies.particles.terms.term import PairTerm, Term
-from eddies.scene.terms import TERMS, TermError
+from eddies.scene.terms import TERMS, PairNetwork, TermError
 from tests.particles.configurations import (
     FLOW, MODELS, PAIR_MODELS, Given, declared, distributed, dynamics_of, given, model, of_terms, state,
 )
@@ -155,12 +156,75 @@ def test_a_term_that_contradicts_its_declaration_is_named(comm):
     slab, particles = distributed(comm, *state())
     with pytest.raises(TermError, match="density"):
         of_terms(Given(None, reads=("density",), gives=("density",)))
-    for function, gives in ((lambda context: context.particles.velocity, ("acceleration",)),
-                            (lambda context: Rates(), ("density",))):
-        with pytest.raises(TermError, match="Given"):
+    velocity, count = particles.velocity, len(particles)
+    for function, gives, complaint in (
+            (lambda context: velocity, ("acceleration",), "returns a tensor of shape .*must return Rates"),
+            (lambda context: Rates(), ("density",), "and returns none"),
+            (lambda context: Rates(acceleration=velocity[:, 0]), ("acceleration",), rf"must be .*\({count}, 3\)"),
+            (lambda context: Rates(density_rate=velocity), ("density_rate",), rf"must be a real .*\({count},\)"),
+            (lambda context: Rates(acceleration=velocity + 0j), ("acceleration",), "complex128; it must be a real"),
+            (lambda context: Rates(acceleration=velocity.numpy()), ("acceleration",), "a ndarray; it must be"),
+            (lambda context: Rates(density_rate=velocity[:, 0]), ("acceleration",), 'add "density_rate" to `gives`'),
+            (lambda context: Rates(acceleration=velocity[count]), ("acceleration",),
+             r"configurations.py, line \d+: IndexError: index")):
+        with pytest.raises(TermError, match=f"Given: .*{complaint}"):
             dynamics_of(slab, of_terms(Given(function, gives=gives))).rates(particles)
-    with pytest.raises(NotImplementedError, match="Term has no forward"):
+    with pytest.raises(TermError, match=r"Term: has no forward\(context\)"):
         dynamics_of(slab, of_terms(Term(declared(), FLOW))).rates(particles)
+    for values in (lambda pairs: pairs.distance, lambda pairs: pairs.x.T, lambda pairs: None):
+        with pytest.raises(TermError, match="AnyPairs: pair_values returns .*a column for each pair"):
+            dynamics_of(slab, of_terms(AnyPairs(values))).rates(particles)
+    network = build_network(PairNetwork(network=f"{__name__}:Narrow"), 2, 0)
+    with pytest.raises(TermError, match=r"Narrow: returns a tensor of shape \(1, 5\).*must return .* \(2, 5\)"):
+        outputs_of(network, torch.zeros(5, 5), 2)
+
+
+class AnyPairs(PairTerm):
+    """A sum of a function of pairs."""
+
+    def __init__(self, values):
+        super().__init__(declared(("pairs",)), FLOW)
+        self.pair_values = values
+
+
+class Narrow(torch.nn.Module):
+    """A network with one output."""
+
+    def __init__(self, inputs, hidden, outputs, seed):
+        super().__init__()
+
+    def forward(self, features):
+        return features[:1]
+
+
+class Learned(Term):
+    """A term with one parameter, whose acceleration is a function of context and parameter."""
+
+    def __init__(self, acceleration):
+        super().__init__(declared(), FLOW)
+        self.factor, self.acceleration = torch.nn.Parameter(torch.ones((), dtype=torch.float64)), acceleration
+
+    def forward(self, context):
+        return Rates(acceleration=self.acceleration(context, self.factor))
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_fault_that_shapes_do_not_show_is_found_before_training(comm):
+    slab, particles = distributed(comm, *state())
+    before = particles.velocity.clone()
+    for acceleration, complaint in (
+            (lambda context, factor: factor * context.particles.velocity, None),
+            (lambda context, factor: context.particles.velocity.clamp_(-0.1, 0.1), "in place; work on a copy"),
+            (lambda context, factor: factor * context.particles.velocity / 0.0, "not finite with the initial"),
+            (lambda context, factor: factor.detach() * context.particles.velocity, "on the parameter factor, which")):
+        lagrangian = LagrangianModel({"own": Learned(acceleration)}, FLOW)
+        context = dynamics_of(slab, lagrangian).context(particles)
+        if complaint is None:
+            lagrangian.check_terms(context)
+        else:
+            with pytest.raises(TermError, match=f'term "own": .*{complaint}'):
+                lagrangian.check_terms(context)
+        particles.velocity.copy_(before)
 
 
 class NoTerm:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from eddies.import_path import users_code
 from eddies.kernels.pairs import PairSpace
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles import moments
@@ -21,6 +22,7 @@ from eddies.particles.kriging import Kriging
 from eddies.particles.neighborhood import LocalParticles
 from eddies.particles.pairs import CompiledSum, ScaledPairs, compiled_sums
 from eddies.particles.particle_set import ParticleSet
+from eddies.particles.rates import described
 from eddies.particles.resolved_velocity import ResolvedFlow, ResolvedVelocity
 from eddies.scene.terms import TermError
 
@@ -50,7 +52,8 @@ class PairSum:
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
         """Values to sum over neighbours, (components, m). They must vanish beyond the radius of interaction."""
-        raise NotImplementedError(f"{type(self).__name__} has no pair_values(pairs)")
+        raise TermError(f"{type(self).__name__}: has no pair_values(pairs); define it, and let it return "
+                        "(components, m)")
 
     def compiled(self, context: Context) -> CompiledSum | None:
         """The same sum for the compiled library, or None. Each class must define it itself; it is not inherited."""
@@ -202,7 +205,7 @@ class Context:
         together = self.rows is not None or torch.is_grad_enabled()
         blocks = []
         for pairs in [self._pairs(self.rows)] if together else self.pairs_in_blocks(max(s.width for s in summands)):
-            values = [summand.pair_values(pairs) for summand in summands]
+            values = [_values(summand, pairs) for summand in summands]
             blocks.append(pairs.pairs.sum(torch.cat(values).T).T)
         return torch.cat(blocks, dim=1).split([len(value) for value in values])
 
@@ -219,6 +222,17 @@ class Context:
         together = max(PAIR_VALUES_TOGETHER[self.particles.position.device.type] // width, 1)
         for block in self.local.neighbors.blocks(together):
             yield self._pairs(block)
+
+
+def _values(summand: PairSum, pairs: ScaledPairs) -> Tensor:
+    """The values of pairs of a sum; raises TermError, with the class, if it fails or returns something else."""
+    with users_code(type(summand), TermError):
+        values = summand.pair_values(pairs)
+    count = len(pairs.pairs.distance)
+    if not isinstance(values, Tensor) or values.dim() != 2 or values.shape[1] != count or values.is_complex():
+        raise TermError(f"{type(summand).__name__}: pair_values returns {described(values)}; it must return real "
+                        f"numbers of shape (components, {count}): a column for each pair")
+    return values
 
 
 class _SharedMoments(PairSum):

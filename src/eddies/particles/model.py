@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pkgutil import iter_modules
@@ -13,12 +13,12 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from eddies.errors import UserError
-from eddies.import_path import is_path, load, short_name
+from eddies.import_path import is_path, load, short_name, users_code
 from eddies.parallel.reduction import any_rank
 from eddies.particles import terms as built_in
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
-from eddies.particles.rates import BY_PARTICLE, Rates, total
+from eddies.particles.rates import BY_PARTICLE, Rates, described, total
 from eddies.particles.terms.resolved_forces import Forcing
 from eddies.particles.terms.term import PairTerm, Term
 from eddies.scene.terms import TermError, TermSettings
@@ -31,6 +31,9 @@ TERMS: dict[str, type[Term]] = {
     if isinstance(kind, type) and issubclass(kind, Term) and kind.Settings.word}
 # Name of the forcing among the terms of a model.
 FORCING = "injection"
+# What a term must declare to return a rate. Pressure modes are ignored unless a term reads the density.
+GIVES_OF = {"acceleration": "acceleration", "force_modes": "acceleration", "density": "density",
+            "density_rate": "density_rate", "shift_velocity": "shift_velocity", "shift_acceleration": "shift_velocity"}
 # The rates that a linear term stores.
 STORED = (*BY_PARTICLE, "density")
 
@@ -143,6 +146,39 @@ class LagrangianModel(nn.Module):
         terms = self._stages[0] if self.density_is_given else self.terms.items()
         return {name: self._linear_rates(term, context) for name, term in terms if term.linear}
 
+    def check_terms(self, context: Context) -> None:
+        """Raise TermError for a fault of a term that its shapes do not show; collective.
+
+        These are rates that are not finite, a change of the particles in place, a parameter without an effect on the
+        rates, and a term that declares itself linear and is not.
+        """
+        columns = list(context.particles.columns().values())
+        before = [column.clone() for column in columns]
+        if self.density_is_given:
+            self.rates(context)  # gives the density that some terms read
+        for name, term in self.terms.items():
+            for column, values in zip(columns, before):
+                column.copy_(values)
+            context.forget_sums(term)
+            rates = _evaluated(term, context)
+            if any_rank(context.comm, not all(map(torch.equal, columns, before))):
+                raise TermError(f'term "{name}": changes the particles in place; work on a copy, such as '
+                                "context.particles.velocity.clone()")
+            values = [value for value in vars(rates).values() if value is not None]
+            if any_rank(context.comm, not all(bool(torch.isfinite(value).all()) for value in values)):
+                raise TermError(f'term "{name}": its rates are not finite with the initial parameters; look for a '
+                                "division by zero, a root or a logarithm")
+            parameters = dict(term.named_parameters())
+            size = sum(value.abs().square().sum() for value in values if value.requires_grad)
+            reached = [None] * len(parameters)
+            if parameters and isinstance(size, Tensor):
+                reached = torch.autograd.grad(size, list(parameters.values()), allow_unused=True)
+            for parameter, gradient in zip(parameters, reached):
+                if not any_rank(context.comm, gradient is not None):
+                    raise TermError(f'term "{name}": its rates do not depend on the parameter {parameter}, which '
+                                    "cannot be learned; use it in forward without detach(), or make it a buffer")
+        self.require_linear(context)
+
     @torch.no_grad()
     def require_linear(self, context: Context) -> None:
         """Raise TermError if a term that declares itself linear is not, at parameters other than the stored ones;
@@ -192,7 +228,8 @@ class LagrangianModel(nn.Module):
         """Rates of a term at the particles with other values of its parameters."""
         context.forget_sums(term)
         named = {name: value for (name, _), value in zip(term.named_parameters(), values)}
-        return self._at_particles(_checked(functional_call(term, named, (context,)), term), context)
+        rates = _checked(term, context, lambda: functional_call(term, named, (context,)))
+        return self._at_particles(rates, context)
 
     def _linear_rates(self, term: Term, context: Context) -> LinearRates:
         parameters = list(term.parameters())
@@ -249,17 +286,38 @@ def _everywhere(term: Term) -> bool:
 
 
 def _evaluated(term: Term, context: Context) -> Rates:
-    rates = _checked(term(context.everywhere if _everywhere(term) else context), term)
+    where = context.everywhere if _everywhere(term) else context
+    rates = _checked(term, where, lambda: term(where))
     return rates if isinstance(term, PairTerm) else rates.at(context.rows)
 
 
-def _checked(result: object, term: Term) -> Rates:
-    """The result of a term's forward; raises TermError unless it is Rates with the declared density."""
+def _checked(term: Term, context: Context, evaluate: Callable[[], object]) -> Rates:
+    """The rates that a term gives. Raises TermError, with the class of the term, if it fails, or if it returns
+    something else than Rates of the declared kinds and of one row for each particle."""
+    name, gives = type(term).__name__, term.settings.gives
+    with users_code(type(term), TermError):
+        result = evaluate()
     if not isinstance(result, Rates):
-        raise TermError(f"{type(term).__name__}: forward returns a {type(result).__name__}; it must return Rates")
-    if "density" in term.settings.gives and result.density is None and result.pressure_modes is None:
-        raise TermError(f'{type(term).__name__}: declares that it gives "density", and returns none; take it out of '
-                        "`gives` of its settings, or return density or pressure_modes")
+        raise TermError(f"{name}: forward returns {described(result)}; it must return Rates")
+    if "density" in gives and result.density is None and result.pressure_modes is None:
+        raise TermError(f'{name}: declares that it gives "density", and returns none; take it out of `gives` of its '
+                        "settings, or return density or pressure_modes")
+    owned = len(context.particles)
+    count = owned if context.rows is None or not isinstance(term, PairTerm) else len(context.rows)
+    for rate, value in vars(result).items():
+        if value is None:
+            continue
+        if (declared := GIVES_OF.get(rate)) not in (None, *gives):
+            raise TermError(f'{name}: returns {rate}, and does not declare it; add "{declared}" to `gives` of its '
+                            "settings")
+        of_modes = rate.endswith("modes")
+        if of_modes:
+            shape = (*([3] if rate == "force_modes" else []), *context.resolved.grid.spectral.spectral_shape)
+        else:
+            shape = (owned if rate == "density" else count, *([] if rate.startswith("density") else [3]))
+        if not isinstance(value, Tensor) or tuple(value.shape) != shape or value.is_complex() != of_modes:
+            kind = "complex" if of_modes else "real"
+            raise TermError(f"{name}: {rate} is {described(value)}; it must be a {kind} tensor of shape {shape}")
     return result
 
 

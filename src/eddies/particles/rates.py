@@ -50,6 +50,13 @@ class Rates:
         return replace(self, **kept)
 
 
+def described(value: object) -> str:
+    """A value that a user's code returns, as text: the shape and type of a tensor, or else the class."""
+    if isinstance(value, Tensor):
+        return f"a tensor of shape {tuple(value.shape)} and type {str(value.dtype).removeprefix('torch.')}"
+    return f"a {type(value).__name__}"
+
+
 def total(contributions: Iterable[Rates]) -> Rates:
     """Sum of contributions; a rate that none of them has is None."""
     sums: dict[str, Tensor] = {}

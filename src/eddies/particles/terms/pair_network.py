@@ -8,14 +8,14 @@ import math
 import torch
 from torch import Tensor, nn
 
-from eddies.import_path import is_path, load
+from eddies.import_path import is_path, load, users_code
 from eddies.particles import moments
 from eddies.particles.context import Context
 from eddies.particles.dense_network import DenseNetwork
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.pairs import CompiledSum, ScaledPairs
 from eddies.particles.periodic_box import safe_norm
-from eddies.particles.rates import Rates
+from eddies.particles.rates import Rates, described
 from eddies.particles.terms.term import PairTerm
 from eddies.scene import terms as declared
 from eddies.scene.terms import ForceSum, NetworkSettings, PairSum, TermError
@@ -95,11 +95,20 @@ def build_network(settings: NetworkSettings, outputs: int, seed: int) -> nn.Modu
     kind = load(settings.network)
     if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
         raise TermError(f'network = "{settings.network}": must be a class derived from torch.nn.Module')
-    try:
+    hint = f'; network = "{settings.network}" is called with (inputs, hidden, outputs, seed)'
+    with users_code(kind, TermError, hint):
         return kind(inputs, tuple(settings.hidden), outputs, seed)
-    except TypeError as error:
-        raise TermError(f'network = "{settings.network}": cannot be made with (inputs, hidden, outputs, seed): '
-                        f"{error}") from error
+
+
+def outputs_of(network: nn.Module, features: Tensor, outputs: int) -> Tensor:
+    """Outputs (outputs, m) of a network for features (inputs, m) of pairs. TermError if a user's network fails, or
+    returns something else."""
+    with users_code(type(network), TermError):
+        found = network(features)
+    if not isinstance(found, Tensor) or found.shape != (outputs, features.shape[1]):
+        raise TermError(f"{type(network).__qualname__}: returns {described(found)}; the network must return a tensor "
+                        f"of shape ({outputs}, {features.shape[1]}): outputs, pairs")
+    return found
 
 
 class PairNetwork(PairTerm):
@@ -131,7 +140,7 @@ class PairNetwork(PairTerm):
         return pairs.invariants(self.settings.inputs, self.mutual)
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
-        along_x, along_v = window(pairs, self.settings) * self.network(self.features(pairs))
+        along_x, along_v = window(pairs, self.settings) * outputs_of(self.network, self.features(pairs), 2)
         v = pairs.v / (safe_norm(pairs.v) + SMALL) if self.settings.basis == "unit" else pairs.v
         return torch.cat([along_x * separation_direction(pairs, self.settings), along_v * v])
 
@@ -166,7 +175,7 @@ class DensityFlux(PairTerm):
         return pairs.invariants(self.settings.inputs, symmetric=False)
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
-        flux = window(pairs, self.settings) * self.network(self.features(pairs))
+        flux = window(pairs, self.settings) * outputs_of(self.network, self.features(pairs), 1)
         if not self.settings.sign:
             return flux
         own, other = pairs.densities

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from eddies.particles.context import Context, PairSum
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
-from eddies.scene.terms import TermBase, TermSettings
+from eddies.scene.terms import TermBase, TermError, TermSettings
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Term(nn.Module, TermBase):
 
     def forward(self, context: Context) -> Rates:
         """Contribution to all owned particles; may be collective."""
-        raise NotImplementedError(f"{type(self).__name__} has no forward(context)")
+        raise TermError(f"{type(self).__name__}: has no forward(context); define it, and let it return Rates")
 
 
 class PairTerm(Term, PairSum):
@@ -69,7 +69,7 @@ class PairTerm(Term, PairSum):
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """Contribution from the sums (components, k) over each particle's neighbours."""
-        raise NotImplementedError(f"{type(self).__name__} has no rates_of(sums, context)")
+        raise TermError(f"{type(self).__name__}: has no rates_of(sums, context); define it, and let it return Rates")
 
     def forward(self, context: Context) -> Rates:
         return self.rates_of(context.pair_sums(self), context)

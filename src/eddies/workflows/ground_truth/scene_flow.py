@@ -13,7 +13,7 @@ from eddies.flow.courant import CourantLimit, FixedStep
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.initial_fields import INITIAL_FLOWS, balanced_density, sound_wave_density
 from eddies.flow.navier_stokes import FLUIDS, Fluid
-from eddies.import_path import is_path, load
+from eddies.import_path import is_path, load, users_code
 from eddies.io.errors import ProductError
 from eddies.io.flow_states import StoredStates, VelocityCubes, open_states
 from eddies.parallel.broadcast import on_all_ranks
@@ -33,7 +33,9 @@ def build_fluid(flow: Flow, forcing: Forcing | None, comm: Comm) -> Fluid:
     grid = SpectralGrid(SlabDecomposition(comm, BOX_LENGTH, flow.cells), flow.precision)
     forced = LinearForcing(grid, forcing.injection_rate, forcing.wavenumber) if forcing is not None else None
     kind = load(flow.fluid) if is_path(flow.fluid) else FLUIDS[flow.fluid]
-    return kind(grid, flow.viscosity, flow.sound_speed if flow.compressible else math.inf, forced)
+    hint = f'; [flow] fluid = "{flow.fluid}" is called with (grid, viscosity, sound_speed, forcing)'
+    with users_code(kind, SceneError, hint):
+        return kind(grid, flow.viscosity, flow.sound_speed if flow.compressible else math.inf, forced)
 
 
 def build_step_limit(time: Time, flow: Flow, grid: SpectralGrid) -> CourantLimit | FixedStep:
@@ -65,7 +67,9 @@ def initial_state(initial: Initial, seed: int, fluid: Fluid) -> np.ndarray:
 def _velocity_of_user(initial: Initial, seed: int, grid: SpectralGrid) -> np.ndarray:
     """The solenoidal part of the velocity that a function of the user returns. Raises SceneError for a wrong shape."""
     shape = (3, *grid.spectral_shape)
-    velocity = load(initial.kind)(grid, initial, seed)
+    function = load(initial.kind)
+    with users_code(function, SceneError, f'; [initial] kind = "{initial.kind}" is called with (grid, initial, seed)'):
+        velocity = function(grid, initial, seed)
     if not isinstance(velocity, np.ndarray) or velocity.shape != shape:
         returned = f"an array {velocity.shape}" if isinstance(velocity, np.ndarray) else f"a {type(velocity).__name__}"
         raise SceneError(f'[initial] kind = "{initial.kind}": returned {returned}; must be the modes (3, kz, ky, kx) = '

@@ -39,7 +39,7 @@ def one_step_phases(data: Sequence[TrainingData], kernel: SmoothingKernel | None
     settings = data[0].settings
     if data[0].definition.model.foreign:
         first = data[0].frames[0]
-        data[0].model.require_linear(first.dynamics.context(first.particles))
+        data[0].model.check_terms(first.dynamics.context(first.particles))
     trainers = [each.force_trainer(kernel) for each in data]
     held_out = [each.validation_frame() for each in data]
     alone = settings.steps - settings.combined_steps

@@ -9,10 +9,10 @@ from typing import Any, Protocol
 
 import torch
 
-from eddies.import_path import is_path, load
+from eddies.import_path import is_path, load, users_code
 from eddies.io.checkpoint import Checkpoint
 from eddies.particles.particle_set import ParticleSet
-from eddies.scene.scene import Scene
+from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.eulerian_run import EulerianRun
 from eddies.workflows.rollout.particle_run import ParticleRun
@@ -76,7 +76,9 @@ def make_method(scene: Scene, step: TimeStep | None, truth: GroundTruth, start: 
         given = replace(settings, integrator=step.integrator, step=step.size, step_from=None, confirmed_on=None)
         scene = replace(scene, simulation=given)
     kind = load(settings.method) if is_path(settings.method) else METHODS[settings.method]
-    method = kind(scene, truth, start, directory, truth.device)
+    hint = f'; [simulation] method = "{settings.method}" is called with (scene, truth, start, directory, device)'
+    with users_code(kind, SceneError, hint):
+        method = kind(scene, truth, start, directory, truth.device)
     if step is not None and isinstance(method, ParticleRun):
         method.limited = False
     return method
