@@ -37,7 +37,7 @@ def test_a_flow_from_a_program(comm, tmp_path):
     comm.Barrier()
     eddies.run(replace(scene, title="another"), output=tmp_path, comm=comm)
     assert (tmp_path / "ground_truth.h5").stat().st_mtime_ns == before
-    other = eddies.load_scene("abc", ["time.duration=0.2"])
+    other = eddies.load_scene("abc", ["time.duration=0.05"])  # a longer one would continue
     with pytest.raises(eddies.SceneError.__mro__[1], match="--overwrite"):
         eddies.run(other, output=tmp_path, comm=comm)
     eddies.run(other, output=tmp_path, overwrite=True, comm=comm)

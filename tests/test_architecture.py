@@ -44,7 +44,8 @@ ONLY_IN = {
     "eddies.scene.[!it]*": ("scene*", "workflows*", "cli", "api", "stored_run", "stages"),
     "eddies.scene.integrators*": ("scene*", "particles.integrators", "workflows*"),
     "eddies.scene.terms*": ("scene*", "particles.context", "particles.model", "particles.terms*", "workflows*"),
-    "eddies.import_path*": ("scene*", "particles.model", "particles.terms.pair_network", "workflows*"),
+    "eddies.import_path*": ("scene*", "particles.context", "particles.model", "particles.terms.pair_network",
+                            "workflows*"),
     "ctypes*": ("kernels*",),
     "pickle*": (),
 }

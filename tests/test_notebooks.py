@@ -16,6 +16,7 @@ from mpi_tools.launch import mpi_environment
 NOTEBOOKS = Path(__file__).parents[1] / "docs" / "notebooks"
 SMALLER = ["spin_up.turnovers=0.3", "tracers.particles_per_side=8", "tracers.field_cells=12",
            "tracers.turnovers=0.3", "kernel.steps=4", "kernel.points=50"]
+NO_SEARCH = "simulation.step=0.1"
 TRAINED_LESS = ["training.steps=8", "training.combined_steps=2", "training.frames=2", "training.batch=64"]
 # Like the fixtures quick_spectra and undrawn, in the process of the notebooks. Only the figure of PDFs is drawn.
 QUICK = """
@@ -82,7 +83,7 @@ def test_notebooks_are_kept_without_output():
 
 def test_a_first_run(execute, folder):
     cells, (error, without) = execute("a-first-run", "[error.values.tolist(), without.values.tolist()]",
-                                      changes=[*SMALLER, "simulation.turnovers=0.1"])
+                                      changes=[*SMALLER, "simulation.turnovers=0.1", NO_SEARCH])
     shown = figures(cells)
     assert set(shown) == {"paths", "spectra", "field", "report"} and min(map(len, shown.values())) > 9000
     assert (folder / "runs/tiny/report/index.html").exists()
@@ -91,7 +92,7 @@ def test_a_first_run(execute, folder):
 
 def test_a_term_of_ones_own(execute, folder):
     cells, (constant, table) = execute("own-term", "[constant, table.to_dict('index')]", turnovers=0.1,
-                                       changes=[*SMALLER, *TRAINED_LESS])
+                                       changes=[*SMALLER, *TRAINED_LESS, NO_SEARCH])
     assert set(figures(cells)) == {"spectra"} and list(table) == ["none", "smagorinsky", "deconvolution"]
     assert 0 < constant < 0.3 and constant != pytest.approx(0.17, rel=1e-6)
     error = {name: row["acceleration"] for name, row in table.items()}
@@ -113,7 +114,7 @@ def test_another_flow(execute):
 
 def test_error_against_run_time(execute, folder):
     cells, (front, rows) = execute("error-against-run-time", "[list(front.index), table.to_dict('index')]",
-                                   changes=SMALLER, turnovers=0.15)
+                                   changes=[*SMALLER, NO_SEARCH], turnovers=0.15)
     assert set(figures(cells)) == {"front"} and (folder / "runs/cost/report/index.html").exists()
     assert {row["status"] for row in rows.values()} == {"complete"}
     cost, error = ([row[key] for row in rows.values()] for key in ("wall_seconds", "velocity_error_end"))

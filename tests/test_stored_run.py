@@ -1,3 +1,6 @@
+import os
+import warnings
+
 import numpy as np
 import pytest
 
@@ -81,9 +84,31 @@ def test_missing_parts_are_errors(directory, tmp_path):
     with pytest.raises(eddies.UserError, match="holds none of ground_truth.h5"):
         eddies.open_run(tmp_path / "nowhere")
     run = eddies.open_run(directory)
+    last = run.trajectories().sizes["particle"] - 1
     for ask, words in ((lambda: run["rollout/forces"], "no forces.*particles/model"),
                        (lambda: run["movie"], "no movie.*ground_truth, kernel, model, rollout"),
                        (lambda: run.field(of="tracers"), 'of = "tracers": .*filtered, unfiltered'),
+                       (lambda: run.field(time=1e9), r"time = 1e\+09: must be between 0 and"),
+                       (lambda: run.field("pressure"), '"pressure": no such variable; there are .*velocity'),
+                       (lambda: run.trajectories([3, last + 1]), rf"ids = \[3, {last + 1}\]: .* 0 to {last},"),
+                       (lambda: run.trajectories([0.5]), "must be integers"),
                        (lambda: run.metrics, "metrics.json: no such file")):
         with pytest.raises(eddies.UserError, match=words):
             ask()
+    (directory / "report").mkdir()
+    (directory / "report" / "metrics.json").write_text("[1, 2]")
+    with pytest.raises(eddies.UserError, match="metrics.json: is damaged; run `eddies report"):
+        run.metrics  # noqa: B018
+
+
+@pytest.mark.mpi(1)
+def test_metrics_older_than_a_product_are_named(directory):
+    run, metrics = eddies.open_run(directory), directory / "report" / "metrics.json"
+    metrics.parent.mkdir()
+    metrics.write_text('{"cost": {"ranks": 1}}')
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert run.metrics == {"cost": {"ranks": 1}}
+    os.utime(directory / "rollout.h5", (metrics.stat().st_mtime + 9,) * 2)
+    with pytest.warns(UserWarning, match="metrics.json: is older than rollout.h5; run `eddies report"):
+        assert run.metrics == {"cost": {"ranks": 1}}

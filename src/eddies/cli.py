@@ -215,11 +215,12 @@ def report_command(options: argparse.Namespace, comm: Comm) -> None:
     """Make the report of a run directory."""
     if not options.run.is_dir():
         raise SceneError(f"{options.run}: no such directory; give a run directory, such as runs/tiny")
-    import_module("eddies.workflows.report").run(options.run, comm, options.variants)
-    log.log(OUTCOME, "report: %s", options.run / REPORT)
+    import_module("eddies.workflows.report").run(options.run, comm, options.variants, output=options.output)
+    page = options.run / REPORT if options.output is None else options.output / REPORT.name
+    log.log(OUTCOME, "report: %s", page)
     if options.open and comm.rank == 0:
         import webbrowser
-        webbrowser.open((options.run / REPORT).resolve().as_uri())
+        webbrowser.open(page.resolve().as_uri())
 
 
 def export_command(options: argparse.Namespace, comm: Comm) -> None:

@@ -58,6 +58,8 @@ def build_parser() -> argparse.ArgumentParser:
     add_run(report, "run")
     add_variants(report, "show this variant after the table of all; repeatable, the first counts")
     add_log_options(report)
+    report.add_argument("--output", type=directory, metavar="DIR",
+                        help="write the page there instead of RUN/report, such as for a run that cannot be written")
     report.add_argument("--open", action="store_true", help="show the page in a browser")
     export = add_command(commands, "export", "fields and particles of a run directory, for other programs")
     add_run(export, "run")

@@ -32,7 +32,7 @@ class Output:
     """Replaces standard output while a command runs.
 
     Characters that the encoding lacks are written as "\\u2264". A line that cannot be written, as on a full disk, does
-    not end the run; `end` reports it.
+    not end the run; `end` reports it, unless the reader of a pipe has left, such as `head`.
     """
 
     def __init__(self) -> None:
@@ -41,7 +41,7 @@ class Output:
                 setattr(sys, name, open(os.devnull, "w"))
             if hasattr(getattr(sys, name), "reconfigure"):
                 getattr(sys, name).reconfigure(errors="backslashreplace")
-        self._stream, self._refusal = sys.stdout, ""
+        self._stream, self._refusal, self._lost = sys.stdout, "", False
         sys.stdout = self  # type: ignore[assignment]
 
     def __getattr__(self, name: str) -> Any:
@@ -60,16 +60,19 @@ class Output:
         """Restore the stream. Returns None, or a message if some text could not be written."""
         self.flush()
         sys.stdout = self._stream
+        if self._lost:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())  # discards buffered text
         if not self._refusal:
             return None
-        os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())  # discards buffered text
         return f"cannot write to standard output: {self._refusal}; make room, or send it elsewhere"
 
     def _try(self, action: Callable[[], Any]) -> None:
         try:
             action()
         except OSError as error:
-            self._refusal = error.strerror or str(error)
+            self._lost = True
+            if not isinstance(error, BrokenPipeError):
+                self._refusal = error.strerror or str(error)
 
 
 def show_warnings() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import warnings
 from collections.abc import Sequence
 from functools import cached_property, partial
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 
 from eddies.errors import UserError
 from eddies.pipeline import STAGES
+from eddies.scene.rules import shortened
 from eddies.scene.scene import Scene, load_scene
 
 TRAJECTORIES = {"tracers": "ground_truth/particles/tracers", "model": "rollout/particles/model",
@@ -104,7 +105,13 @@ class StoredRun:
         path = self.path / "report" / "metrics.json"
         if not path.is_file():
             raise UserError(f"{path}: no such file; run `eddies report {self.path}` first")
-        return json.loads(path.read_text())
+        made = path.stat().st_mtime
+        newer = [file for file in map(self._files.get, self.products) if (self.path / file).stat().st_mtime > made]
+        if newer:
+            warnings.warn(f"{path}: is older than {', '.join(newer)}; run `eddies report {self.path}` again",
+                          stacklevel=2)
+        from eddies.io.provenance import read_metrics
+        return read_metrics(path)
 
     def trajectories(self, ids: Any = None, of: str = "model", unwrapped: bool = False) -> Any:
         """Position, velocity and other columns of all particles or those with these ids.
@@ -113,6 +120,9 @@ class StoredRun:
         are continuous beyond the periodic cube.
         """
         found = self[chosen(TRAJECTORIES, of)]
+        if ids is not None:
+            count = np.asarray(found["position"]).shape[1] if isinstance(found, dict) else found.sizes["particle"]
+            check_ids(np.asarray(ids), count)
         if isinstance(found, dict):  # without xarray
             rows = slice(None) if ids is None else np.asarray(ids)
             found = {key: values[:, rows] if values.ndim > 1 else values[rows] if key == "id" else values
@@ -184,8 +194,22 @@ def chosen(table: dict[str, Any], of: str) -> Any:
     return table[of]
 
 
+def check_ids(ids: np.ndarray, count: int) -> None:
+    """Raise UserError for ids that are no particles of a run with so many."""
+    if ids.dtype.kind not in "iu" or ids.size and not 0 <= ids.min() <= ids.max() < count:
+        raise UserError(f"ids = {shortened(str(ids.tolist()))}: must be integers from 0 to {count - 1}, the particles "
+                        "of the run")
+
+
 def at_time(found: Any, name: str, time: float | None) -> Any:
-    """A variable at the stored time nearest to `time`, or the last."""
+    """A variable at the stored time nearest to `time`, or the last. Raises UserError for an unknown variable, and for a
+    time more than an interval before the first or after the last."""
+    if name not in found or name == "time":
+        raise UserError(f'"{name}": no such variable; there are {", ".join(key for key in found if key != "time")}')
+    times = np.asarray(found["time"])
+    around = np.diff(times).max() if len(times) > 1 else np.inf
+    if time is not None and not times[0] - around <= time <= times[-1] + around:
+        raise UserError(f"time = {time:g}: must be between {times[0]:g} and {times[-1]:g}, the stored times")
     if isinstance(found, dict):  # without xarray
         return found[name][-1 if time is None else int(np.argmin(np.abs(found["time"] - time)))]
     return found[name].isel(time=-1) if time is None else found[name].sel(time=time, method="nearest")

@@ -164,6 +164,7 @@ def test_all_numbers_are_listed_and_of_series_the_last_frame(comm, tmp_path):
         found = {place: (frame, np.max(values)) for place, frame, values in stored_numbers(file)}
     assert found == {
         "errors/delay": (None, 2), "errors/single": (None, 0.5), "rollout, attribute turnovers": (None, 1.5),
-        "particles/model/box/edges": (None, 1), "particles/none/box/edges": (None, 1), "fields/model/velocity": (2, 2),
+        "particles/model/box/edges/value": (2, 1), "particles/model/box, attribute edge": (None, 1),
+        "particles/none/box, attribute edge": (None, 1), "fields/model/velocity": (2, 2),
         "particles/model/velocity/value": (2, 2), "fields/model/time": (2, 0.2),
         **{place: (2, 0.2) for place in found if place.startswith("particles/model") and place.endswith("time")}}

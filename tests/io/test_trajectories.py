@@ -56,12 +56,25 @@ def test_layout_is_h5md(comm, tmp_path):
         group = file["particles/model"]
         assert group["box"].attrs["dimension"] == 3
         assert list(group["box"].attrs["boundary"]) == [b"periodic"] * 3
-        assert np.allclose(group["box/edges"], 2 * np.pi)
+        assert np.array_equal(group["box/edges/value"], [np.diag([2 * np.pi] * 3)] * FRAMES)
         assert np.array_equal(group["id"], np.arange(TOTAL))
         for column, shape in COLUMNS.items():
             element = group[column]
             assert element["value"].shape == (FRAMES, TOTAL, *shape)
             assert element["time"] == group["time"] and element["step"] == group["step"]
+
+
+@pytest.mark.mpi(1)
+def test_mdanalysis_reads_the_frames(comm, tmp_path):
+    from MDAnalysis import Universe
+    write(comm, tmp_path / "t.h5")
+    universe = Universe.empty(TOTAL)
+    universe.load_new(str(tmp_path / "t.h5"), format="H5MD")
+    assert len(universe.trajectory) == FRAMES
+    for frame, step in enumerate(universe.trajectory):
+        assert step.data["time"] == 0.5 * frame
+        assert np.allclose(step.positions, values(frame, "position"), rtol=1e-6)
+        assert np.allclose(step.dimensions, [*[2 * np.pi] * 3, 90, 90, 90])
 
 
 @pytest.mark.mpi(1)

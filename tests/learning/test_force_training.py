@@ -245,7 +245,7 @@ def test_a_nan_ends_the_training_on_all_ranks(comm):
         trainer.model.terms["pairs"].network.biases[-1][0] = torch.nan
     phase = Phase("all losses", np.ones(3), (1e-2, 1e-3), trainer.combined_step,
                   lambda: trainer.combined_error(trainer.frames[0], 2), 1)
-    with pytest.raises(TrainingDiverged, match="step 0 .*loss is nan"):
+    with pytest.raises(TrainingDiverged, match="step 1 .*loss is nan"):
         Training(comm, trainer.model, [phase]).step()
 
 

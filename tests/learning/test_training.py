@@ -111,7 +111,7 @@ def test_a_loss_that_is_not_finite_ends_the_training_on_all_ranks(comm):
     training = training_of(comm)
     with torch.no_grad():
         training.model.weight[0, 1] = np.inf
-    with pytest.raises(TrainingDiverged, match="step 0 .*phase 0.*loss"):
+    with pytest.raises(TrainingDiverged, match="step 1 .*phase 0.*loss"):
         finished(training)
 
 
@@ -128,7 +128,7 @@ def test_validation_errors_that_are_not_finite_are_never_the_best(comm):
     assert training.columns()["validation_error"][[1, 3, 5]].tolist() == [np.inf, 3.0, np.inf]
     assert training.columns()["start_error"][0] == np.inf and training.cost[0]["error"] == 3.0
     errors = iter([np.nan] * 4)
-    with pytest.raises(TrainingDiverged, match="step 5 .*phase 0.*finite"):
+    with pytest.raises(TrainingDiverged, match="step 6 .*phase 0.*finite"):
         finished(training_of(comm, validate, steps=(6,)))
 
 

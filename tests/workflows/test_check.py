@@ -101,4 +101,4 @@ def test_problems_are_reported_and_refusals_raised(comm, caplog):
     scene = load_scene("taylor-green", ["initial.kind=file", "initial.path=nowhere.h5"])
     with pytest.raises(SceneError, match="nowhere.h5"):
         lines_of(scene, comm, caplog)
-    assert "fails here          nowhere.h5" in "\n".join(record.getMessage() for record in caplog.records)
+    assert f"fails here          {Path.cwd()}/nowhere.h5" in "\n".join(record.getMessage() for record in caplog.records)

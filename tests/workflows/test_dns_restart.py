@@ -9,7 +9,7 @@ from eddies.io.checkpoint import Checkpoint
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.stop import Stopped
-from eddies.scene.scene import load_scene
+from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import dns
 from tests.small_scene import TINY
 from tests.workflows.stopping import StopAtStep
@@ -70,7 +70,7 @@ def test_a_split_of_a_run_is_the_whole_run(comm, tmp_path, monkeypatch):
     monkeypatch.setattr("eddies.io.checkpoint.CheckpointDirectory.remove", lambda self: None)
     dns.run(scene, comm, whole, StopAtStep(comm, every_step=True))
     truth = product(comm, whole)
-    assert len(truth["frames"]) == 5 and len(list((whole / "checkpoints").glob("step-*"))) == STEPS
+    assert len(truth["frames"]) == 5 and len(list((whole / "checkpoints").glob("step-*"))) == STEPS + 1
     for split in SPLITS:
         directory = tmp_path / f"split-{split}"
         if comm.rank == 0:
@@ -100,17 +100,58 @@ def test_a_stopped_run_continues_with_its_forcing_and_leaves_nothing_else(comm, 
     comm.Barrier()
     dns.run(scene, comm, run)
     assert_same(comm, run, product(comm, whole))
-    assert [path.name for path in run.iterdir()] == ["ground_truth.h5"]
+    assert sorted(path.name for path in run.iterdir()) == ["checkpoints", "ground_truth.h5"]
+    assert [path.name for path in (run / "checkpoints").iterdir()] == ["step-00000020.h5"]
 
 
 @pytest.mark.mpi(1)
 def test_a_run_without_tracers_continues(comm, tmp_path, last):
-    scene = load_scene("taylor-green", ["flow.cells=12", "time.duration=0.2", "time.step=0.02"])
+    """After two stops, and after its end for longer, but not for less."""
+    keys = ["flow.cells=12", "time.step=0.02"]
+    scene = load_scene("taylor-green", [*keys, "time.duration=0.2"])
     for split in (0, 4):
         with pytest.raises(Stopped):
             dns.run(scene, comm, tmp_path, StopAtStep(comm, split))
     dns.run(scene, comm, tmp_path)
     assert last[0].clock.steps == 10 and last[0].clock.time == pytest.approx(0.2)
+    dns.run(load_scene("taylor-green", [*keys, "time.duration=0.3"]), comm, tmp_path)
+    assert last[0].clock.steps == 15 and last[0].clock.time == pytest.approx(0.3)
+    with pytest.raises(SceneError, match="duration = 0.2: the checkpoint in .* is later; raise it, or remove"):
+        dns.run(scene, comm, tmp_path)
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_finished_run_goes_on_for_longer(comm, tmp_path, caplog):
+    scene, (whole, run) = load_scene(TINY, SPLIT), (tmp_path / "whole", tmp_path / "run")
+    short = load_scene(TINY, [*SPLIT, "tracers.turnovers=0.09"])
+    for path in (whole, run) if comm.rank == 0 else ():
+        path.mkdir()
+    comm.Barrier()
+    dns.run(scene, comm, whole)
+    expected = product(comm, whole)
+    dns.run(short, comm, run)
+    found = product(comm, run)
+    assert len(found["frames"]) < len(expected["frames"])
+    caplog.set_level("INFO", "eddies")
+    caplog.clear()
+    with pytest.raises(Stopped):
+        dns.run(scene, comm, run, StopAtStep(comm, 2))
+    dns.run(scene, comm, run)
+    assert caplog.text.count("continues from step") == 2
+    found = product(comm, run)
+    # The states of the whole flow, from which coarse grids start, are those of both ends.
+    assert len(found.pop("whole")) >= len(expected.pop("whole"))
+    for name, values in expected.items():
+        assert np.array_equal(found[name], values), name
+    with pytest.raises(SceneError, match="turnovers = 0.09: the checkpoint in"):
+        dns.run(short, comm, run)
+    comm.Barrier()
+    if comm.rank == 0:
+        (run / "ground_truth.h5").unlink()
+    comm.Barrier()
+    dns.run(short, comm, run)  # without its frames the checkpoint is worth nothing
+    assert comm.rank > 0 or "lacks the frames before the checkpoint" in caplog.text
+    assert len(product(comm, run)["frames"]) < len(expected["frames"])
 
 
 @pytest.mark.mpi(3)

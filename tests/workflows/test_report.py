@@ -325,6 +325,10 @@ def test_a_dns_alone(comm, tmp_path):
     (tmp_path / "stage_seconds.json").write_text('{"dns": 12.5}')
     report.run(tmp_path, comm)
     assert written(tmp_path)[0]["cost"]["stage_seconds"] == {"dns": 12.5}
+    before = (tmp_path / "report" / "index.html").read_bytes()
+    report.run(tmp_path, comm, output=tmp_path / "elsewhere" / "page")
+    assert (tmp_path / "elsewhere" / "page" / "index.html").read_text().count("<img") == 3
+    assert (tmp_path / "report" / "index.html").read_bytes() == before
 
 
 @pytest.mark.usefixtures("no_figures")

@@ -39,7 +39,7 @@ log = logging.getLogger("eddies")
 KEPT = 3
 NAME = re.compile(r"step-(\d{8,})(\.h5)?")
 PLAIN = "plain"  # the dataset of everything that is not an array, as JSON
-FORMAT = 10  # of the layout; others are not used. Raise it also with the format of products: frames are such.
+FORMAT = 11  # of the layout; others are not used. Raise it also with the format of products: frames are such.
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,8 @@ def room(path: Path | str, wanted: int) -> str:
     """The bytes wanted for a file, unless unknown (0), and the free bytes of its file system, as text."""
     disk = os.statvfs(next(place for place in Path(path).absolute().parents if place.is_dir()))
     free = disk.f_bavail * disk.f_frsize
+    if disk.f_files and not disk.f_favail:
+        return "its file system has no room for another file (no free inodes); remove files there"
     return f"{wanted} bytes wanted, {free} free" if wanted else f"{free} bytes free"
 
 

@@ -45,7 +45,8 @@ class FrameLayout:
 
 
 class FrameSegments:
-    """The files frames-NNNNNNNN.h5 of a directory, named after their first step; `names` lists the closed ones.
+    """The files frames-NNNNNNNN.h5 of a directory, named after their first step; `names` lists the closed ones. The
+    first may be a product with the same series.
 
     If the context ends with an exception, the open segment is removed. `assemble` copies all frames into the product.
     """
@@ -74,7 +75,7 @@ class FrameSegments:
         """Time and this rank's block of the first frames of a trajectory, from closed segments, which all have it."""
         frames: list[tuple[float, dict[str, np.ndarray]]] = []
         for segment in self.names[:count]:  # each holds one frame or more
-            with open_product(self.comm, self.directory / segment, "frames") as file:
+            with open_product(self.comm, self.directory / segment, None) as file:
                 stored = Trajectory(file, name)
                 frames += [(time, self._values(stored, frame)) for frame, time in enumerate(stored.times[:count])]
         return frames[:count]
@@ -87,7 +88,7 @@ class FrameSegments:
                  for name, series in self.layout.fields.items()}
         start, _ = id_block(self.comm, self.layout.total)
         for name in self.names:
-            with open_product(self.comm, self.directory / name, "frames") as segment:
+            with open_product(self.comm, self.directory / name, None) as segment:
                 for group, trajectory in trajectories.items():
                     frames = Trajectory(segment, group)
                     for frame, (step, time) in enumerate(zip(frames.steps, frames.times)):

@@ -23,6 +23,7 @@ from eddies.parallel.broadcast import on_all_ranks, on_first_rank, share_text
 from eddies.pipeline import MAKER_OF
 
 CHUNK_BYTES = 2**20
+FEW = 9  # values, of which a chunk has many frames
 SERIES = "particles/", "fields/"  # groups whose datasets have frames
 File = h5py.File
 Result = TypeVar("Result")
@@ -131,9 +132,10 @@ def stored_numbers(file: h5py.File) -> Iterator[tuple[str, int | None, np.ndarra
 def growing_dataset(group: h5py.Group, name: str, frame_shape: tuple[int, ...], dtype: Any) -> h5py.Dataset:
     """Create an empty dataset (frames, *frame_shape) for `append_frame`; collective.
 
-    A chunk has about 1 MiB at most: a part of a frame, or many frames of a single value.
+    A chunk has about 1 MiB at most: a part of a frame, or many frames of a few values.
     """
-    chunk, largest = [1 if frame_shape else 1024], CHUNK_BYTES // np.dtype(dtype).itemsize
+    values = math.prod(frame_shape)
+    chunk, largest = [256 // values if 0 < values <= FEW else 1], CHUNK_BYTES // np.dtype(dtype).itemsize
     for axis, extent in enumerate(frame_shape):
         chunk.append(max(1, min(extent, largest // max(math.prod(frame_shape[axis + 1:]), 1))))
     with writing(group, HEADER_BYTES):

@@ -128,3 +128,14 @@ def _read_sound(path: str | Path, read: Callable[[h5py.File], dict[str, Any]]) -
 def _damaged(file: h5py.File, name: str) -> ProductError:
     return ProductError(f"{file.filename}: its attribute {name} is not what was written, the file is damaged; delete "
                         "it and make it again")
+
+
+def read_metrics(path: Path) -> dict[str, Any]:
+    """The numbers of a report by section. Raises ProductError if the file is damaged."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        found = None
+    if not isinstance(found, dict):
+        raise ProductError(f"{path}: is damaged; run `eddies report {path.parents[1]}` again")
+    return found

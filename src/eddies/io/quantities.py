@@ -41,7 +41,7 @@ POINTS = "at the points i edge / cells of the periodic cube, i = 0, 1, ..."
 QUANTITIES = {
     "particles/*/id": Quantity("1", "particle", "of the particle in each row of every frame"),
     "particles/*/step": Quantity("1", "time", "number of the time step"),
-    "particles/*/box/edges": Quantity("L", "xyz", "edges of the periodic cube"),
+    "particles/*/box/edges/value": Quantity("L", "time i j", "edges of the periodic cube, on the diagonal"),
     "particles/*/position/value": Quantity("L", f"{PARTICLES} xyz", "wrapped into the cube, 0 <= x < edge"),
     "particles/*/image/value": Quantity("1", f"{PARTICLES} xyz", "position + edge * image goes on beyond the cube"),
     "particles/*/velocity/value": Quantity("L/T", f"{PARTICLES} xyz", "of the particles"),

@@ -1,6 +1,8 @@
 """Particle trajectories in the H5MD 1.1 layout (de Buyl, Colberg & Höfling, Comput. Phys. Commun. 185, 1546).
 
-Row k of every frame belongs to the particle with id k, so frames can be compared without sorting.
+Row k of every frame belongs to the particle with id k, so frames can be compared without sorting. The box has edges for
+every frame, and the attribute `unit` names units of molecules for L, T and L/T, for readers such as MDAnalysis, which
+accept no others.
 """
 
 from collections.abc import Mapping
@@ -14,6 +16,7 @@ from eddies.io.hdf5 import (append_frame, find_group, growing_dataset, read_fram
                             write_attributes)
 
 IMAGE = "image"
+UNITS = {"position": "Angstrom", "velocity": "Angstrom ps-1"}
 ROUNDING = 1e-6  # of positions in single precision
 
 
@@ -38,11 +41,13 @@ class TrajectoryWriter:
         _write_header(file)
         self._group = file.create_group(f"particles/{name}")
         box = self._group.create_group("box")
-        write_array(box, "edges", np.full(3, length))
-        write_attributes(box, {"dimension": 3, "boundary": np.array([b"periodic"] * 3)})
+        write_attributes(box, {"edge": length, "dimension": 3, "boundary": np.array([b"periodic"] * 3)})
         write_array(self._group, "id", np.arange(total))
         self._step = growing_dataset(self._group, "step", (), np.int64)
         self._time = growing_dataset(self._group, "time", (), np.float64)
+        write_attributes(self._time, {"unit": "ps"})
+        self._edges = self._element("box/edges", (3, 3), np.float64)
+        write_attributes(self._edges, {"unit": UNITS["position"]})
         self._columns = {column: self._element(column, (total, *shape), dtype)
                          for column, shape in columns.items()}
         self._length, self._images = length, images
@@ -55,6 +60,7 @@ class TrajectoryWriter:
         """Add a frame: this rank holds rows start, start + 1, ... of every column, by id; maybe none."""
         append_frame(self._step, np.array(step), ())
         append_frame(self._time, np.array(time), ())
+        append_frame(self._edges, np.diag([self._length] * 3), (0, 0))
         if self._images:
             columns = {**columns, IMAGE: self._count_images(columns["position"])}
         for column, dataset in self._columns.items():
@@ -64,7 +70,10 @@ class TrajectoryWriter:
         element = self._group.create_group(column)
         # Hard links: all columns share their times.
         element["step"], element["time"] = self._step, self._time
-        return growing_dataset(element, "value", frame_shape, dtype)
+        values = growing_dataset(element, "value", frame_shape, dtype)
+        if column in UNITS:
+            write_attributes(values, {"unit": UNITS[column]})
+        return values
 
     def _count_images(self, position: np.ndarray) -> np.ndarray:
         """The images (n, 3) of this rank's particles at the wrapped positions (n, 3) of the next frame."""
@@ -81,7 +90,9 @@ class Trajectory:
     def __init__(self, file: h5py.File, name: str) -> None:
         self._group = group = find_group(file, f"particles/{name}")
         self.total = group["id"].shape[0]  # number of particles
-        self.length = float(group["box/edges"][0])  # edge of the periodic cube
+        box = group["box"]
+        # Edge of the periodic cube. Files of eddies 1.0 have one set of edges for all frames.
+        self.length = float(box.attrs["edge"] if "edge" in box.attrs else box["edges"][0])
         self.columns = tuple(column for column in group if f"{column}/value" in group)
         self._in_order: set[tuple[int, int | None]] = set()  # rows whose ids have been checked
 

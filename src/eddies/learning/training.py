@@ -103,7 +103,7 @@ class Training:
         start = {"start_error": self._error_of(phase.validate)} if phase.validate and self.optimizer.taken == 0 else {}
         row = {"phase": float(self.number), "step": float(self.steps), "learning_rate": rate, **start,
                **phase.take(self.optimizer, self.optimizer.taken)}
-        place = f"step {self.steps} of the training ({phase.name})"
+        place = f"step {self.steps + 1} of the training ({phase.name})"
         for name in ("loss", "gradient_norm"):
             if not np.isfinite(row[name]):
                 raise TrainingDiverged(f"{place}: {name} is {row[name]}, at a learning rate of {rate:.3g}")

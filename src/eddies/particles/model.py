@@ -158,7 +158,8 @@ class LagrangianModel(nn.Module):
             self.rates(context)  # gives the density that some terms read
         for name, term in self.terms.items():
             for column, values in zip(columns, before):
-                column.copy_(values)
+                if not torch.equal(column, values):
+                    column.copy_(values)
             context.forget_sums(term)
             rates = _evaluated(term, context)
             if any_rank(context.comm, not all(map(torch.equal, columns, before))):

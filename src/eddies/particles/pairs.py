@@ -129,7 +129,7 @@ class ScaledPairs:
 
     @cached_property
     def distance(self) -> Tensor:
-        """|x| (m,)."""
+        """Length of x (m,)."""
         return self.pairs.distance / self.flow.scales.filter_width
 
     @cached_property

@@ -119,6 +119,11 @@ class Scene(Section):
         return Path("runs") / self.name
 
     @property
+    def duration(self) -> float:
+        """How long the direct simulation goes on after its spin-up: turnovers with tracers, a time without them."""
+        return self.tracers.turnovers if self.tracers is not None else self.time.duration
+
+    @property
     def window(self) -> float:
         """Fraction of the ground truth that training may use. Without [training] it is the default of that section."""
         return self.training.window if self.training else DEFAULT_WINDOW

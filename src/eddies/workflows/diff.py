@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from eddies.io.hdf5 import ProductError, in_files
+from eddies.io.hdf5 import in_files
+from eddies.io.provenance import read_metrics
 from eddies.parallel.communicator import Comm
 from eddies.report.page import shown
 from eddies.scene.scene import load_scene
@@ -32,16 +32,9 @@ def diff_lines(one: Path, other: Path) -> list[str]:
     lines = [*table("setting", settings, runs), ""]
     if missing := [path for path in runs if not (path / METRICS).is_file()]:
         return [*lines, f"no numbers to compare: {', '.join(f'`eddies report {path}`' for path in missing)} makes them"]
-    metrics = [flattened(_read_metrics(path)) for path in runs]
+    metrics = [flattened(read_metrics(path / METRICS)) for path in runs]
     numbers = [{key: value for key, value in each.items() if isinstance(value, int | float)} for each in metrics]
     return [*lines, *table("number", numbers, runs, ratio=True)]
-
-
-def _read_metrics(run: Path) -> dict[str, Any]:
-    try:
-        return json.loads((run / METRICS).read_text(encoding="utf-8"))
-    except ValueError:
-        raise ProductError(f"{run / METRICS}: is damaged; run `eddies report {run}` again") from None
 
 
 def flattened(nested: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -15,18 +16,19 @@ from eddies.flow.history import FlowHistory
 from eddies.io.checkpoint import Guard
 from eddies.io.fields import FieldWriter
 from eddies.io.frame_segments import FrameSegments
-from eddies.io.hdf5 import File, create_product, write_attributes, write_table
+from eddies.io.hdf5 import File, ProductError, create_product, open_product, write_attributes, write_table
+from eddies.io.trajectories import Trajectory
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
 from eddies.pipeline import STAGES
-from eddies.scene.scene import Scene
+from eddies.scene.scene import Scene, SceneError
 from eddies.scene.sections import SpinUp
 from eddies.time_stepping import STEPPERS
 from eddies.workflows.ground_truth.flow_run import FlowRun, TracerRun, frame_layout
 from eddies.workflows.ground_truth.frame_counts import whole_frames
 from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
 from eddies.workflows.problems import check_span
-from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
+from eddies.workflows.run_directory.fingerprints import course_fingerprint, stage_provenance
 
 log = logging.getLogger("eddies")
 
@@ -38,13 +40,21 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     """Simulate the flow of a scene and write ground_truth.h5: statistics, and frames and fields with [tracers].
 
     The flow is first spun up ([spin_up]). The forcing ends at the release of the tracers, unless [tracers] forced. The
-    run continues from the newest checkpoint in the directory that has the same settings.
+    run continues from the newest checkpoint in the directory that has the same settings, except for how long it goes
+    on. The last state is kept as such a checkpoint; the frames before it are then those of the product.
 
-    Raises Stopped, after a checkpoint, if `stop` requests it.
+    Raises SceneError if the checkpoint is later than the end of the run, and Stopped, after a checkpoint, if `stop`
+    requests it.
     """
     directory = Path(directory)
-    guard = Guard(comm, directory / STAGES["dns"].checkpoints, stage_fingerprint(scene, "dns"), stop)
+    product, course = directory / STAGES["dns"].file, course_fingerprint(scene)
+    guard = Guard(comm, directory / STAGES["dns"].checkpoints, course, stop)
     saved, fluid = guard.checkpoints.newest(), build_fluid(scene.flow, scene.forcing, comm)
+    if saved is not None and saved["phase"] == "tracers" and not saved.files and not holds_frames(
+            comm, product, saved["frames"]):
+        log.warning("%s: lacks the frames before the checkpoint, which is not used", product)
+        guard.checkpoints.remove()
+        saved = None
     state = initial_state(scene.initial, scene.seed, fluid) if saved is None else None
     flow = FlowRun(fluid, state, STEPPERS[scene.time.stepper](fluid),
                    build_step_limit(scene.time, scene.flow, fluid.grid), FlowHistory(fluid), guard,
@@ -52,7 +62,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     if saved is not None:
         flow.load_state_dict(saved)
         log.info("dns: continues from step %d, time %.4g", flow.clock.steps, flow.clock.time)
-    with create_product(comm, directory / STAGES["dns"].file, "ground_truth", stage_provenance(scene, "dns")) as file:
+    provenance = {**stage_provenance(scene, "dns"), "course": course, "duration": scene.duration}
+    with create_product(comm, product, "ground_truth", provenance) as file:
         if saved is None:
             flow.history.sample(flow.state, flow.clock)
         if flow.phase == "spin-up":
@@ -63,17 +74,25 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 span = scene.tracers.turnovers * flow.history.sample(flow.state, flow.clock)["eddy_turnover_time"]
                 check_span(scene.time, span, flow.step_limit.bound(flow.state, flow.clock), scene.tracers)
             layout = frame_layout(scene.tracers, fluid.compressible, fluid.grid.cutoff)
-            with FrameSegments(comm, guard.checkpoints.path, layout, saved.files if saved is not None else ()) as parts:
+            before = () if saved is None else saved.files or [f"../{product.name}"]
+            with FrameSegments(comm, guard.checkpoints.path, layout, before) as parts:
                 whole = partial(whole_frames, scene.simulation, scene.training, scene.tracers.field_every)
                 tracers = TracerRun(flow, parts, scene.tracers, scene.seed, whole, saved)
+                if tracers.interval > tracers.intervals:
+                    raise too_late(guard, f"[tracers] turnovers = {scene.tracers.turnovers:g}")
                 tracers.follow()
+                final = flow.state_dict()
+                flow.history.sample(flow.state, flow.clock)
                 parts.assemble(file)
             scales = scales_of(tracers.released) | tracers.scales()
             if fluid.forcing is not None:
                 write_attributes(file.create_group("forcing"), asdict(scene.forcing))
             tracers.write_spectra(file)
         else:
+            if flow.phase == "run" and flow.clock.time > flow.began + scene.time.duration:
+                raise too_late(guard, f"[time] duration = {scene.time.duration:g}")
             run_for(flow, scene.time.duration, partial(check_span, scene.time))
+            final = flow.state_dict()
             write_final_fields(file, flow)
             scales = scales_of(flow.history.sample(flow.state, flow.clock))
         write_attributes(file.create_group("reference"), {
@@ -84,6 +103,19 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         if scene.spin_up is not None and scene.spin_up.stationary is not None:
             write_attributes(file.create_group("stationary"), stationary_span(scene.spin_up, flow.history))
     guard.checkpoints.remove()
+    guard.checkpoints.write(flow.steps, final)
+
+
+def holds_frames(comm: Comm, product: Path, count: int) -> bool:
+    """Whether a ground truth has so many frames; collective."""
+    with suppress(ProductError), open_product(comm, product, "ground_truth") as file:
+        return len(Trajectory(file, "tracers").times) == count
+    return False
+
+
+def too_late(guard: Guard, key: str) -> SceneError:
+    """The error of a checkpoint that is later than the end of the run."""
+    return SceneError(f"{key}: the checkpoint in {guard.checkpoints.path} is later; raise it, or remove that directory")
 
 
 def run_for(flow: FlowRun, duration: float, check: SpanCheck) -> None:
@@ -91,8 +123,8 @@ def run_for(flow: FlowRun, duration: float, check: SpanCheck) -> None:
     clock = flow.clock
     if flow.phase == "start":
         check(duration, flow.step_limit.bound(flow.state, clock))
-        clock.end, flow.phase = clock.time + duration, "run"
-    start = clock.end - duration
+        flow.began, flow.phase = clock.time, "run"
+    start, clock.end = flow.began, flow.began + duration
     progress = ProgressLine("dns", flow.history.describe, done=(clock.time - start) / duration)
     flow.advance([flow.history, lambda _, clock: progress((clock.time - start) / duration, clock.steps)])
 

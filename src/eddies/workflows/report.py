@@ -91,16 +91,17 @@ class Run:
     """A run directory: its scene (None if there is no readable one), the rollouts of its variants, and its pages.
 
     pages: directory of each variant that was run, the one of the main page in front. Without a rollout of a variant it
-    is the run directory itself, under the name "".
+    is the run directory itself, under the name "". output: directory of the reports; None: "report" in each directory.
     """
 
     directory: Path
     scene: Scene | None
     places: Mapping[str, Sequence[Place]]
     pages: Mapping[str, Path]
+    output: Path | None = None
 
     @classmethod
-    def of(cls, directory: Path, first: Sequence[str] = ()) -> Run:
+    def of(cls, directory: Path, first: Sequence[str] = (), output: Path | None = None) -> Run:
         """Read a run directory. The main page shows the first variant of `first` that was run, or else
         the first of all variants that was run."""
         scene, places = None, {}
@@ -111,7 +112,7 @@ class Run:
             places = rollouts(scene, directory) if scene.simulation is not None else {}
         ran = {name: where[0].directory for name, where in places.items() if _has_rollout(where[0].directory)}
         main = next((name for name in (*first, *ran) if name in ran), "")
-        return cls(directory, scene, places, {main: ran.get(main, directory), **ran})
+        return cls(directory, scene, places, {main: ran.get(main, directory), **ran}, output)
 
     @property
     def main(self) -> str:
@@ -123,12 +124,17 @@ class Run:
         places = [place.directory for place in self.places[name]] if name else [self.directory]
         return list(filter(_has_rollout, places))
 
+    def report_of(self, page: Path) -> Path:
+        """The directory of the report about a run directory."""
+        return page / "report" if self.output is None else self.output / page.relative_to(self.directory)
+
     def links(self, page: Path) -> list[tuple[str, str]]:
         """Titles and relative paths of the other pages, as seen from the page in a directory."""
         found = [] if page == self.directory else [(f"all of {self.scene.name}", self.directory)]
         found += [(name, where) for name, where in self.pages.items() if where not in (page, self.directory)
                   and not (page == self.directory and name == self.main)]
-        return [(title, os.path.relpath(where / "report" / "index.html", page / "report")) for title, where in found]
+        return [(title, os.path.relpath(self.report_of(where) / "index.html", self.report_of(page)))
+                for title, where in found]
 
 
 def _has_rollout(directory: Path) -> bool:
@@ -141,9 +147,11 @@ def run_stage(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest
     run(directory, comm, variants, stop)
 
 
-def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: StopRequest | None = None) -> None:
+def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: StopRequest | None = None,
+        output: Path | None = None) -> None:
     """Write report/index.html, report/figures/*.png and report/metrics.json of a run directory; all ranks call it.
 
+    With `output` they are written there instead, and those of variants in directories below it.
     For a scene with variants the page begins with their table, followed by the details of one: the first of `variants`
     that was run, or the first of all. Each variant that was run also has a page of its own.
 
@@ -151,21 +159,22 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: S
     SceneError if `variants` names an unknown variant; Stopped, before any page is written, when `stop` asks for it.
     """
     directory, stop = Path(directory), stop or StopRequest(comm)
-    for problem in place_problems(("report",), comm, directory):
+    for problem in place_problems(("report",), comm, directory) if output is None else ():
         raise SceneError(problem)
-    stored = in_files(comm, directory, lambda: Run.of(directory, variants))
+    stored = in_files(comm, directory, lambda: Run.of(directory, variants, output))
     alone = comm.Split(comm.rank)
     try:
         made, rows = _make(stored, comm, alone, stop)
         own = [page for page in made.values() if page.directory != directory]
         on_all_ranks(comm, lambda: in_files(alone, directory, lambda: [
-            _write(page, page.directory, stored.links(page.directory)) for page in own]), ProductError)
+            _write(page, page.directory, stored.report_of(page.directory), stored.links(page.directory))
+            for page in own]), ProductError)
     finally:
         alone.Free()
     for name, where in stored.pages.items():
         if where != directory:
-            log.info("report: variant %s: %s", name, where / "report" / "index.html")
-    in_files(comm, directory / "report", lambda: _write_main(stored, made[stored.main], rows, comm))
+            log.info("report: variant %s: %s", name, stored.report_of(where) / "index.html")
+    in_files(comm, stored.report_of(directory), lambda: _write_main(stored, made[stored.main], rows, comm))
 
 
 def sections_of(directory: Path, alone: Comm) -> list[Section]:
@@ -383,7 +392,7 @@ def _table_section(stored: Run, rows: Mapping[str, Row]
 
 def _write_main(stored: Run, page: Page, rows: Mapping[str, Row], comm: Comm) -> None:
     """Write the main page, with the table of variants if there is one, and log its numbers; one rank calls it."""
-    output, scene, beside = stored.directory / "report", stored.scene, {}
+    output, scene, beside = stored.report_of(stored.directory), stored.scene, {}
     first, table = _table_section(stored, rows)
     page.draw(first)
     page.sections = [*first, *page.sections]
@@ -400,7 +409,7 @@ def _write_main(stored: Run, page: Page, rows: Mapping[str, Row], comm: Comm) ->
                   output / "variants.json": json.dumps(record, indent=2, allow_nan=False) + "\n"}
     page.seconds = {**read_stage_seconds(stored.directory), **page.seconds}
     text = scene.to_toml() if scene is not None and scene.variant else None
-    _write(page, stored.directory, stored.links(stored.directory), beside, text)
+    _write(page, stored.directory, output, stored.links(stored.directory), beside, text)
     for section in page.sections:
         count = len(section.illustrations)
         log.info("report: %s%s", section.title, f" ({count} figure{'s' if count > 1 else ''})" if count else "")
@@ -413,10 +422,10 @@ def _write_main(stored: Run, page: Page, rows: Mapping[str, Row], comm: Comm) ->
         log.warning("report: %s", warning)
 
 
-def _write(page: Page, directory: Path, links: Sequence[tuple[str, str]], beside: Mapping[Path, str] | None = None,
-           scene: str | None = None) -> None:
-    """Write a page and its numbers below a run directory. `scene` is the text of the scene if it has variants and the
-    page is about all of them."""
+def _write(page: Page, directory: Path, output: Path, links: Sequence[tuple[str, str]],
+           beside: Mapping[Path, str] | None = None, scene: str | None = None) -> None:
+    """Write the page and the numbers of a run directory into `output`. `scene` is the text of the scene if it has
+    variants and the page is about all of them."""
     rows = [("stage", "ranks", "wall time (s)", "date", "eddies", "commit", "libraries")]
     for kind, origin in page.provenance.items():
         stage = MAKER_OF[kind].name
@@ -426,5 +435,5 @@ def _write(page: Page, directory: Path, links: Sequence[tuple[str, str]], beside
                      ", ".join(f"{name} {version}" for name, version in origin["libraries"].items())))
     text = scene or list(page.provenance.values())[-1]["scene"]
     title = tomllib.loads(text).get("title", "untitled scene")
-    write_page(directory / "report", RunRecord(directory.resolve().name, title, text, rows, page.warnings, links),
-               page.sections, page.images, beside or {})
+    write_page(output, RunRecord(directory.resolve().name, title, text, rows, page.warnings, links), page.sections,
+               page.images, beside or {})

@@ -98,14 +98,15 @@ def test_no_key_of_the_settings_of_a_term_goes_unnoticed():
     ("class Mine(Term):\n    def __init__(self, settings, flow): self.factor = nn.Parameter(torch.ones(1))\n",
      'term "own:Mine": cannot be made: AttributeError: '),
     ("class Mine(nn.Module):\n    def __init__(self, inputs): pass\n    def forward(self, features): pass\n",
-     'term "pairs": network = "own:Mine": cannot be made with (inputs, hidden, outputs, seed): ')],
+     'term "pairs": Mine: TypeError: ')],
     ids=["arguments", "no super", "network"])
 def test_a_class_of_the_user_that_cannot_be_made_is_one_error(comm, own, body, where):
     own("own", f"import torch\nfrom torch import nn\nfrom eddies import Term\n{body}")
-    of = definition("model.pairs.network=own:Mine") if "network" in where else with_terms("pressure", "own:Mine")
+    of = definition("model.pairs.network=own:Mine") if "pairs" in where else with_terms("pressure", "own:Mine")
     with pytest.raises(SceneError) as error:
         initial_model(of, SCALES, comm)
     assert str(error.value).startswith(f"[model] terms: {where}")
+    assert "pairs" not in where or str(error.value).endswith("is called with (inputs, hidden, outputs, seed)")
 
 
 def parameters(rank):

@@ -75,7 +75,8 @@ def disk(scene: Scene, stage: str) -> Disk:
         k_max, intervals = flow.largest_wavenumber, expected.frame_intervals
         statistics = (SAMPLE_BYTES + 8 * (math.ceil(math.sqrt(3) * k_max) + 1)) * ((expected.steps or 0) // EVERY)
         state = flow.components * (2 * k_max + 1) ** 2 * (k_max + 1) * 2 * flow.real_bytes
-        checkpoints = (KEPT + 1) * state  # with the one that is written
+        statistics += state           # the last one stays
+        checkpoints = KEPT * state    # with the one that is written
         if tracers is None:
             return Disk(statistics + 4 * flow.components * flow.cells**3, checkpoints)
         during, after = (

@@ -32,8 +32,8 @@ class FlowRun:
     """A fluid and its state, the time stepper, the clock and the history.
 
     `guard` is called before each step; after it `watch` ends a run that has become unstable. `phase` is "spin-up",
-    "start" (of what follows), "run" for a given time, or "tracers", in which `tracers` is set. `max_step` limits the
-    steps with tracers, in addition to `step_limit`.
+    "start" (of what follows), "run" from the time `began` on, or "tracers", in which `tracers` is set. `max_step`
+    limits the steps with tracers, in addition to `step_limit`.
     """
 
     fluid: Fluid
@@ -44,6 +44,7 @@ class FlowRun:
     guard: Guard
     clock: Clock = field(default_factory=Clock)
     phase: str = "start"
+    began: float = 0.0
     tracers: TracerRun | None = None
     max_step: float = np.inf
     watch: StabilityWatch = field(init=False)
@@ -76,13 +77,14 @@ class FlowRun:
     def state_dict(self) -> dict[str, Any]:
         """The state for a checkpoint, with the state of the tracers."""
         modes = saved_modes(self.fluid.grid, self.state)
-        return {"phase": self.phase, "modes": modes, "clock": self.clock.state_dict(),
+        return {"phase": self.phase, "began": self.began, "modes": modes, "clock": self.clock.state_dict(),
                 "step_limit": self.step_limit.state_dict(), "watch": self.watch.state_dict(),
                 **self.history.state_dict(), **(self.tracers.state_dict() if self.tracers else {})}
 
     def load_state_dict(self, saved: Checkpoint) -> None:
         """Continue from a checkpoint, made on any number of ranks. Tracers read their part themselves."""
-        self.phase, self.state = saved["phase"], restored_modes(self.fluid.grid, saved, 4)
+        self.phase, self.began = saved["phase"], saved["began"]
+        self.state = restored_modes(self.fluid.grid, saved, 4)
         self.clock.load_state_dict(saved["clock"])
         self.step_limit.load_state_dict(saved["step_limit"])
         self.watch.load_state_dict(saved["watch"])
@@ -141,14 +143,13 @@ class TracerRun:
         """Follow the tracers to the end of the last interval."""
         flow = self.flow
         progress = ProgressLine("tracers", flow.history.describe, done=self._done)
-        if self.interval > 0:
+        if self.stored <= self.interval:  # stopped within an interval
             self._finish_interval(progress)
         while self.interval < self.intervals:
             self.interval += 1
             self.step = self._longest_step()
             flow.clock.end = flow.clock.time + self.settings.frame_interval
             self._finish_interval(progress)
-        flow.history.sample(flow.state, flow.clock)
 
     def scales(self) -> dict[str, float]:
         """Scales of the filtered flow at the release. Rates are differences between the first two frames, so that the

@@ -15,8 +15,18 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import FOREIGN_IN, Scene
 
 
-def stage_fingerprint(scene: Scene, stage: str) -> str:
-    """Return the SHA-256 of the inputs of a stage's product.
+# The keys that only say how long the direct simulation goes on.
+DURATIONS = "tracers.turnovers", "time.duration"
+
+
+def course_fingerprint(scene: Scene) -> str:
+    """Return the SHA-256 of the inputs of the direct simulation, except how long it goes on. One of the same course can
+    be continued."""
+    return stage_fingerprint(scene, "dns", DURATIONS)
+
+
+def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> str:
+    """Return the SHA-256 of the inputs of a stage's product, `without` some keys.
 
     It covers the settings of the stage and of the scene's earlier stages, the content of the files that the flow, the
     weights and the step come from, the source of the user's classes, and the fingerprints of other ground truths.
@@ -37,7 +47,7 @@ def stage_fingerprint(scene: Scene, stage: str) -> str:
         del settings["simulation"]["confirmed_on"]
     settings |= {f"own_{name}": origins(scene.foreign_in(name)) for name in FOREIGN_IN}
     of_these = {*STAGES[stage].depends_on, stage} & {*scene.stages}
-    read = [[key, _without(settings[key], key, each.but)]
+    read = [[key, _without(settings[key], key, (*each.but, *without))]
             for each in STAGES.values() if each.name in of_these for key in each.reads]
     return hashlib.sha256(json.dumps(read).encode()).hexdigest()
 

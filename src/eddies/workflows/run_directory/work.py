@@ -24,7 +24,7 @@ from eddies.pipeline import STAGES, Stage
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Scene, Simulation
 from eddies.scene.sections import CONVERGED
-from eddies.workflows.run_directory.fingerprints import stage_fingerprint
+from eddies.workflows.run_directory.fingerprints import course_fingerprint, stage_fingerprint
 
 SECONDS = "stage_seconds.json"
 FAILURE = "failure.txt"  # the error of a failed variant
@@ -64,24 +64,45 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path) -> Work:
     for stage in [STAGES[name] for name in stages if STAGES[name].product is not None]:
         product, settings = directory / stage.file, stage_fingerprint(scene, stage.name)
         checkpoints = checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
-        of_others = checkpoints and settings not in [fingerprint for _, fingerprint in checkpoints]
+        continued = course_fingerprint(scene) if stage.name == "dns" else settings
+        of_others = checkpoints and continued not in [fingerprint for _, fingerprint in checkpoints]
         origin = product_provenance(product)
         if origin.get("fingerprint") == settings:
             done.add(stage.name)
-            if not of_others:  # a scene with those settings may still continue from them
+            # Other settings may still be continued, and so may a direct simulation, for longer.
+            if not of_others and stage.name != "dns":
                 useless.add(stage.name)
+            continue
+        same_course = checkpoints and not of_others and origin.get("course") == continued
+        if same_course and origin["duration"] > scene.duration:
+            useless.add(stage.name)  # the checkpoint is too late
+        elif same_course:
+            begun.add(stage.name)
             continue
         if product.is_file() and not product.is_symlink():
             if not origin:
                 _check_readable(product)
             lost.append(stage.file + _cost(origin, seconds.get(stage.name)))
             changes |= dict.fromkeys(changed_settings(stage, origin.get("scene"), scene.to_toml()))
-        if checkpoints and not of_others:
+        if checkpoints and not of_others and stage.name not in useless:
             begun.add(stage.name)
         if of_others:
             useless.add(stage.name)
-            lost.append(f"{stage.checkpoints} (step {checkpoints[0][0]})")
+            if origin.get("course") in [fingerprint for _, fingerprint in checkpoints]:
+                continue  # the last state of the product, which is in the list
+            seconds_so_far = seconds.get(stage.name)
+            cost = "" if seconds_so_far is None else f", took {duration(seconds_so_far)}"
+            lost.append(f"{stage.checkpoints} (step {checkpoints[0][0]}{cost})")
+            changes |= dict.fromkeys(changed_settings(stage, _scene_of(directory), scene.to_toml()))
     return Work(directory, frozenset(done), frozenset(begun), frozenset(useless), tuple(lost), tuple(changes))
+
+
+def _scene_of(directory: Path) -> str | None:
+    """The text of the scene that ran last in a directory; None if it cannot be read."""
+    try:
+        return (directory / "scene.toml").read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return None
 
 
 def step_path(settings: Simulation, directory: Path) -> Path | None:
