@@ -50,8 +50,8 @@ def table(comparison: str, columns: str, rows: str) -> str:
     record = json.loads((HERE / "results" / f"{comparison}.json").read_text(encoding="utf-8"))
     results, keys = {row["name"]: row for row in record["rows"]}, columns.split()
     # Any complete row has the floors, which are the truth's.
-    results[FLOOR] = {key.removesuffix("_floor"): value for key, value in record["rows"][0].items()
-                      if key.endswith("_floor")}
+    results[FLOOR] = {key.removesuffix("_floor"): value for row in record["rows"] for key, value in row.items()
+                      if key.endswith("_floor") and value is not None}
     lines = ["| |" + "".join(f" {WORDS[key]} |" for key in keys), "|---|" + "---|" * len(keys)]
     asked = [] if rows.strip() == "*" else [row.split(": ", 1) for row in rows.strip().splitlines()]
     for name, words in asked or [(row["name"], f"`{row['name']}`") for row in record["rows"]]:

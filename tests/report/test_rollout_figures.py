@@ -30,4 +30,4 @@ def test_planes_are_as_large_with_few_frames(frames):
     figure = velocity_planes([Pair(0.1 * number, plane, plane) for number in range(frames)], 1.0)
     png(figure)
     width = figure.axes[0].get_position().width * figure.get_figwidth()
-    assert width == pytest.approx(2.3 - 0.2, abs=0.03)
+    assert width == pytest.approx(2.05, abs=0.06)

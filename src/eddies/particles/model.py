@@ -165,13 +165,13 @@ class LagrangianModel(nn.Module):
             if any_rank(context.comm, not all(map(torch.equal, columns, before))):
                 raise TermError(f'term "{name}": changes the particles in place; work on a copy, such as '
                                 "context.particles.velocity.clone()")
-            values = [value for value in vars(rates).values() if value is not None]
-            if any_rank(context.comm, not all(bool(torch.isfinite(value).all()) for value in values)):
+            given = [value for value in vars(rates).values() if value is not None]
+            if any_rank(context.comm, not all(bool(torch.isfinite(value).all()) for value in given)):
                 raise TermError(f'term "{name}": its rates are not finite with the initial parameters; look for a '
                                 "division by zero, a root or a logarithm")
             parameters = dict(term.named_parameters())
-            size = sum(value.abs().square().sum() for value in values if value.requires_grad)
-            reached = [None] * len(parameters)
+            size = sum(value.abs().square().sum() for value in given if value.requires_grad)
+            reached: Sequence[Tensor | None] = [None] * len(parameters)
             if parameters and isinstance(size, Tensor):
                 reached = torch.autograd.grad(size, list(parameters.values()), allow_unused=True)
             for parameter, gradient in zip(parameters, reached):

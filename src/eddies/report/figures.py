@@ -21,7 +21,7 @@ DNS, FILTERED, TRUTH, MODEL = "#000000", "#7f7f7f", "#0072B2", "#D55E00"
 SECOND, THIRD, FOURTH = "#009E73", "#CC79A7", "#E69F00"
 GUIDE, NOTE = "#9a9a9a", "#5a5a5a"
 SIGNED, POSITIVE = "RdBu_r", "viridis"
-LEFT, RIGHT, BOTTOM, TOP = 0.74, 0.12, 0.5, 0.3  # inches around a panel, for its labels and its title
+LEFT, RIGHT, BOTTOM, TOP = 0.84, 0.12, 0.5, 0.3  # inches around a panel, for its labels and its title
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 BAR = 0.8  # inches beside a panel for a colour bar with its labels
 

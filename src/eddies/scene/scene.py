@@ -119,7 +119,7 @@ class Scene(Section):
         return Path("runs") / self.name
 
     @property
-    def duration(self) -> float:
+    def duration(self) -> float | None:
         """How long the direct simulation goes on after its spin-up: turnovers with tracers, a time without them."""
         return self.tracers.turnovers if self.tracers is not None else self.time.duration
 
