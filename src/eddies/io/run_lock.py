@@ -24,7 +24,7 @@ from mpi4py import MPI
 
 from eddies.clock import duration
 from eddies.errors import UserError
-from eddies.io.errors import NO_ROOM, WriteError, write_error
+from eddies.io.errors import NO_ROOM, WriteError, file_errors, write_error
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.stop import LOOK_SECONDS, Loss
 
@@ -182,7 +182,8 @@ def lock_directory(comm: MPI.Comm, directory: Path, take_over: bool = False) -> 
 
 def refuse_if_held(comm: MPI.Comm, directory: Path) -> None:
     """Raise RunInUse if another job works in a run directory; collective. Changes nothing."""
-    on_first_rank(comm, lambda: _refuse(directory, find_lock(directory)))
+    with file_errors(directory):
+        on_first_rank(comm, lambda: _refuse(directory, find_lock(directory)))
 
 
 def find_lock(directory: Path) -> FoundLock | None:

@@ -88,7 +88,7 @@ class Initial(Section):
     kind: str = named("initial flow", *INITIAL_FLOWS, default="random")
     amplitude: float = number("amplitude of the velocity; random: rms of a component; sound-wave: that of ln density",
                               default=1.0, above=0)
-    peak_wavenumber: float = number("wavenumber of the spectrum's peak, random only", default=3.0, above=0)
+    peak_wavenumber: float = number("wavenumber of the spectrum's peak, random only", default=3.0, at_least=0.1)
     wavenumber: int = integer("number of waves in the cube; abc, shear-wave, sound-wave only", default=1, at_least=1)
     path: str | None = text("file to start from, on any grid: ground_truth.h5 or its run directory, JHTDB cutout or "
                             "fluidsim state; kind file only", default=None)

@@ -317,6 +317,8 @@ def _ground_truth_sections(file: File) -> list[Section]:
     else:
         wavenumber, energy = energy_spectrum(velocity)
         spectra = {"wavenumber": wavenumber, "energy": energy[None]}
+    if not np.any(spectra["energy"]):
+        return [Section("ground_truth", "Ground truth", notices=["The flow is at rest: its velocity is zero."])]
     sections = [ground_truth.section(statistics, spectra, reference, planes, name)]
     if "stationary" in file:
         try:

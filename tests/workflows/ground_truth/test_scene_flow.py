@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from eddies.errors import UserError
-from eddies.scene.scene import load_scene
+from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows.ground_truth.scene_flow import build_fluid, initial_state
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from tests.small_scene import problems_of
 
 STORED, CELLS = 12, 16
@@ -202,6 +203,15 @@ def test_a_missing_filter_is_named(comm, path, monkeypatch):
         start(comm, tmp)
     with pytest.raises(UserError, match="is no regular file"):
         start(comm, "/dev/null")
+
+
+@pytest.mark.mpi(1)
+def test_an_error_in_a_function_of_the_user_is_named(comm):
+    scene = load_scene("abc", ["initial.kind=os:system"])
+    assert stage_fingerprint(scene, "dns")
+    fluid = build_fluid(scene.flow, None, comm)
+    with pytest.raises(SceneError, match=r"system: TypeError: .* kind = \"os:system\" is called with \(grid, initial"):
+        initial_state(scene.initial, 1, fluid)
 
 
 def test_files_are_searched_beside_the_scene_too(tmp_path, monkeypatch):
