@@ -163,6 +163,10 @@ class RolloutTrainer:
         return float(np.sqrt(squares / (self.total * math.prod(true.shape[1:]))))
 
 
+# Its wrapper loads torch's compiler for two seconds.
+UNWRAPPED = getattr(checkpoint, "__wrapped__", checkpoint)
+
+
 def mean_losses(windows: Sequence[TrainingWindow], stationary: bool = False) -> Tensor:
     """Change of ln(energy) of each band per frame interval, (bands,): mean over windows, or rms if `stationary`."""
     changes = torch.stack([window.energies[-1] / window.energies[0] for window in windows]).log()
@@ -175,4 +179,4 @@ def _recomputed(function: Callable[..., Any], *columns: Tensor) -> Any:
     """The result of a function that is called again for the gradient, instead of keeping its intermediate results."""
     if not torch.is_grad_enabled():
         return function(*columns)
-    return checkpoint(function, *columns, use_reentrant=False, preserve_rng_state=False)
+    return UNWRAPPED(function, *columns, use_reentrant=False, preserve_rng_state=False)
