@@ -13,6 +13,7 @@ import pytest
 from eddies.scene.model import COME_ALONG, WEIGHTS, weights_that_come_along
 from eddies.scene.scene import load_scene
 from eddies.stored_run import open_run
+from tests.left_out import leave_out_figures
 from tests.small_scene import TINY
 from tests.test_cli import run_cli
 
@@ -33,6 +34,7 @@ def run_directory(comm, shared_folder):
     directory = shared_folder() / "tiny"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("eddies.report.figures.png", lambda figure: b"")
+        leave_out_figures(patch)
         patch.setattr("eddies.workflows.rollout.particle_measures.MOST_ITERATIONS", 3)
         assert run_cli("run", TINY, "--output", directory) == 0
     comm.Barrier()
