@@ -1,5 +1,6 @@
 """README.md and docs say what is true: their commands, scenes, keys, links and code are those of this checkout."""
 
+import contextlib
 import dataclasses
 import json
 import re
@@ -15,7 +16,7 @@ from eddies.cli_options import build_parser
 from eddies.scene.sections import METHODS
 from eddies.scene.model import Model, settings_class
 from eddies.scene.rules import quoted
-from eddies.scene.scene import BOX_LENGTH, Scene, builtin_scenes, load_scene
+from eddies.scene.scene import BOX_LENGTH, Scene, SceneError, builtin_scenes, load_scene
 from eddies.scene.sections import Simulation
 from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS
 
@@ -123,6 +124,19 @@ def test_options_in_the_text_exist():
     for option in re.findall(r"`(--(?:set|output|overwrite|take-over)\b)", TEXT):
         assert option in listed
     assert all(f"`{option}" in TEXT for option in listed if option.startswith("--") and option != "--help")
+
+
+def test_changes_of_scenes_in_the_text_are_accepted_by_a_built_in_scene():
+    changes = set(re.findall(r"`[^`\n]*?--set ([a-z][\w.-]+=[^\s`]+)", TEXT))
+
+    def accepted(name, change):
+        with contextlib.suppress(SceneError):
+            return bool(load_scene(name, [change]))
+        return False
+
+    assert changes > (patterns := {"section.key=value", "variant.NAME.section.key=value"})
+    for change in changes - patterns:
+        assert any(accepted(name, change) for name, _ in builtin_scenes()), change
 
 
 def test_variables_in_the_text_are_read_somewhere():

@@ -206,7 +206,7 @@ def _open_checked(path: Path, kind: str | None) -> h5py.File:
         file = open_to_read(path)
     except OSError as error:
         raise unreadable(path, error) or ProductError(
-            f"{path}: damaged or not an HDF5 file ({error}); delete it and make it again") from None
+            f"{path}: damaged or not an HDF5 file ({error}); make it again, or give another file") from None
     try:
         if problem := _problem(file, kind, remedy):
             raise ProductError(f"{path}: {problem}")
@@ -222,7 +222,7 @@ def _problem(file: h5py.File, kind: str | None, remedy: str) -> str | None:
     try:
         stored, complete = str(file.attrs.get("kind", "unknown")), bool(file.attrs.get("complete", False))
     except (OSError, TypeError, ValueError) as error:
-        return f"damaged, its attributes cannot be read ({error}); delete it and make it again"
+        return f"damaged, its attributes cannot be read ({error}); make it again, or give another file"
     if kind not in (None, stored):
         return f"is of kind {stored}, expected {kind}: {remedy}"
     if not complete:

@@ -126,8 +126,8 @@ def _read_sound(path: str | Path, read: Callable[[h5py.File], dict[str, Any]]) -
 
 
 def _damaged(file: h5py.File, name: str) -> ProductError:
-    return ProductError(f"{file.filename}: its attribute {name} is not what was written, the file is damaged; delete "
-                        "it and make it again")
+    return ProductError(f"{file.filename}: its attribute {name} is not what was written, the file is damaged; make it "
+                        "again")
 
 
 def read_metrics(path: Path) -> dict[str, Any]:
