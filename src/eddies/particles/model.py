@@ -112,8 +112,11 @@ class LagrangianModel(nn.Module):
     @property
     def learned_coefficients(self) -> dict[str, list[dict[str, Any]]]:
         """Learned coefficients by name of the term, ready for JSON; see `Coefficient`."""
-        return {name: [asdict(each) for each in term.learned_coefficients] for name, term in self.terms.items()
-                if term.learned_coefficients}
+        found = {}
+        for name, term in self.terms.items():
+            with users_code(type(term), TermError):
+                found[name] = [asdict(each) for each in term.learned_coefficients]
+        return {name: coefficients for name, coefficients in found.items() if coefficients}
 
     def rates(self, context: Context, kept: Mapping[str, LinearRates] | None = None) -> Rates:
         """Sum of the terms; differentiable, collective.

@@ -10,7 +10,7 @@ from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.hdf5 import ProductError, create_product
 from eddies.pipeline import STAGES
 from eddies.scene.scene import load_scene
-from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
+from eddies.workflows.run_directory.fingerprints import course_fingerprint, stage_fingerprint, stage_provenance
 from eddies.workflows.run_directory.work import WorkAtStake, find_work
 from tests.small_scene import TINY
 
@@ -87,12 +87,34 @@ def test_checkpoints_of_other_settings_are_work_too(comm, tmp_path, scene):
     assert work.useless == {"train"} and not work.begun
     with pytest.raises(WorkAtStake, match=r"checkpoints-train \(step 5\)"):
         work.refuse_to_lose()
+    (tmp_path / "scene.toml").write_text(other.to_toml())
+    (tmp_path / "stage_seconds.json").write_text('{"train": 125}')
+    with pytest.raises(WorkAtStake, match=r"steps = 70, now 60.* checkpoints-train \(step 5, took 2 min 05 s\)"):
+        find_work(scene.stages, scene, tmp_path).refuse_to_lose()
     assert not find_work(other.stages, other, tmp_path).lost
     assert not find_work(["dns"], scene, tmp_path).lost
     save(comm, tmp_path, scene, "train", 3)
     assert not find_work(scene.stages, scene, tmp_path).lost  # there is one to go on from
     (tmp_path / "checkpoints-train/step-00000003.h5").write_text("damaged")
     assert find_work(scene.stages, scene, tmp_path).useless == {"train"}
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("turnovers, begun, lost", [(0.7, True, []), (0.5, False, ["ground_truth.h5"])])
+def test_the_last_state_of_a_ground_truth_is_for_longer_ones(comm, tmp_path, scene, turnovers, begun, lost):
+    """The scene's own has 0.6 turnovers. Its last state is not listed beside it."""
+    course = {"course": course_fingerprint(scene), "duration": scene.duration}
+    CheckpointDirectory(comm, tmp_path / "checkpoints", course["course"]).write(9, {})
+    provenance = stage_provenance(scene, "dns") | course
+    with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", provenance):
+        pass
+    work = find_work(["dns"], scene, tmp_path)
+    assert work.done == {"dns"} and not work.useless
+    work = find_work(["dns"], load_scene(TINY, [f"tracers.turnovers={turnovers}"]), tmp_path)
+    assert (work.begun == {"dns"}) == begun and [each.split()[0] for each in work.lost] == lost
+    assert (work.useless == {"dns"}) != begun
+    work = find_work(["dns"], load_scene(TINY, ["seed=5"]), tmp_path)
+    assert [each.split()[0] for each in work.lost] == ["ground_truth.h5"] and work.useless == {"dns"}
 
 
 @pytest.mark.mpi(1)
