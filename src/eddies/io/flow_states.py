@@ -87,9 +87,10 @@ class VelocityCubes:
     def check(self, comm: MPI.Comm, index: int, velocity: np.ndarray) -> None:
         """Raise ProductError for a velocity that cannot be a flow; `velocity` has the planes of this rank."""
         dataset = self._states[index][0]
-        fills = {*NOT_DELIVERED, *(float(np.ravel(dataset.attrs[name])[0]) for name in FILL_ATTRIBUTES
-                                   if np.asarray(dataset.attrs.get(name)).dtype.kind == "f")}
-        for fill in fills:
+        own = [np.ravel(dataset.attrs[name]) for name in FILL_ATTRIBUTES if name in dataset.attrs]
+        fills = dict.fromkeys([*NOT_DELIVERED, *(float(value[0]) for value in own
+                                                 if value.size and value.dtype.kind == "f")])
+        for fill in fills:  # in the same order on all ranks
             with np.errstate(over="ignore"):  # in half precision
                 mark = np.asarray(fill).astype(velocity.dtype)
             if count := int(global_sum(comm, np.count_nonzero(velocity == mark))):
