@@ -77,7 +77,8 @@ def users_code(called: Any, problem: type[UserError], hint: str = "") -> Iterato
         file = getattr(sys.modules.get(module), "__file__", None)
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
         place = f"{file}, line {lines[-1]}: " if lines else ""
-        raise problem(f"{called.__qualname__}: {place}{type(error).__name__}: {error}{hint}") from error
+        name = getattr(called, "__qualname__", type(called).__name__)
+        raise problem(f"{name}: {place}{type(error).__name__}: {error}{hint}") from error
 
 
 def origins(paths: Iterable[str]) -> dict[str, dict[str, str | None]]:

@@ -169,7 +169,8 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
 
 def look_at_work(step: Step, comm: Comm, overwrite: bool) -> Work:
     """Examine the directory of a step. Raises WorkAtStake if work would be replaced without `overwrite`."""
-    work = in_files(comm, step.directory, lambda: find_work([*step.links, *step.stages], step.scene, step.directory))
+    work = in_files(comm, step.directory, lambda: find_work(
+        [*step.links, *step.stages], step.scene, step.directory, step.links))
     if not overwrite:
         work.refuse_to_lose()
     return work

@@ -120,7 +120,7 @@ class StoredRun:
         are continuous beyond the periodic cube.
         """
         found = self[chosen(TRAJECTORIES, of)]
-        if ids is not None:
+        if ids is not None and not isinstance(ids, slice):
             count = np.asarray(found["position"]).shape[1] if isinstance(found, dict) else found.sizes["particle"]
             check_ids(np.asarray(ids), count)
         if isinstance(found, dict):  # without xarray
@@ -196,7 +196,7 @@ def chosen(table: dict[str, Any], of: str) -> Any:
 
 def check_ids(ids: np.ndarray, count: int) -> None:
     """Raise UserError for ids that are no particles of a run with so many."""
-    if ids.dtype.kind not in "iu" or ids.size and not 0 <= ids.min() <= ids.max() < count:
+    if ids.size and (ids.dtype.kind not in "iu" or not 0 <= ids.min() <= ids.max() < count):
         raise UserError(f"ids = {shortened(str(ids.tolist()))}: must be integers from 0 to {count - 1}, the particles "
                         "of the run")
 

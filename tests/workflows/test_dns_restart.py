@@ -7,6 +7,7 @@ import pytest
 
 from eddies.io.checkpoint import Checkpoint
 from eddies.io.hdf5 import open_product, read_attributes, read_table
+from eddies.io.provenance import product_provenance
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.stop import Stopped
 from eddies.scene.scene import SceneError, load_scene
@@ -107,7 +108,7 @@ def test_a_stopped_run_continues_with_its_forcing_and_leaves_nothing_else(comm, 
 @pytest.mark.mpi(1)
 def test_a_run_without_tracers_continues(comm, tmp_path, last):
     """After two stops, and after its end for longer, but not for less."""
-    keys = ["flow.cells=12", "time.step=0.02"]
+    keys = ["flow.cells=12", "time.step=0.02"]  # ten steps of 0.02 are not exactly 0.2
     scene = load_scene("taylor-green", [*keys, "time.duration=0.2"])
     for split in (0, 4):
         with pytest.raises(Stopped):
@@ -130,7 +131,7 @@ def test_a_finished_run_goes_on_for_longer(comm, tmp_path, caplog):
     dns.run(scene, comm, whole)
     expected = product(comm, whole)
     dns.run(short, comm, run)
-    found = product(comm, run)
+    found, made = product(comm, run), product_provenance(run / "ground_truth.h5")
     assert len(found["frames"]) < len(expected["frames"])
     caplog.set_level("INFO", "eddies")
     caplog.clear()
@@ -138,6 +139,7 @@ def test_a_finished_run_goes_on_for_longer(comm, tmp_path, caplog):
         dns.run(scene, comm, run, StopAtStep(comm, 2))
     dns.run(scene, comm, run)
     assert caplog.text.count("continues from step") == 2
+    assert product_provenance(run / "ground_truth.h5")["id"] == made["id"]
     found = product(comm, run)
     # The states of the whole flow, from which coarse grids start, are those of both ends.
     assert len(found.pop("whole")) >= len(expected.pop("whole"))

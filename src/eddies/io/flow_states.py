@@ -89,15 +89,15 @@ class VelocityCubes:
         dataset = self._states[index][0]
         own = [np.ravel(dataset.attrs[name]) for name in FILL_ATTRIBUTES if name in dataset.attrs]
         fills = dict.fromkeys([*NOT_DELIVERED, *(float(value[0]) for value in own
-                                                 if value.size and value.dtype.kind == "f")])
+                                                 if value.size and value.dtype.kind == "f" and value[0])])
         for fill in fills:  # in the same order on all ranks
             with np.errstate(over="ignore"):  # in half precision
                 mark = np.asarray(fill).astype(velocity.dtype)
             if count := int(global_sum(comm, np.count_nonzero(velocity == mark))):
                 raise ProductError(f"{_place(dataset)}: {count} values are {fill:.6g}, the mark of points that were "
                                    "not delivered or written; get the file again")
-        lowest = global_min(comm, velocity.min(axis=(1, 2, 3), initial=np.inf))
-        highest = global_max(comm, velocity.max(axis=(1, 2, 3), initial=-np.inf))
+        lowest = global_min(comm, velocity.min(axis=(1, 2, 3), initial=np.inf).astype(np.float64))
+        highest = global_max(comm, velocity.max(axis=(1, 2, 3), initial=-np.inf).astype(np.float64))
         if (lowest == highest).all():
             value = ", ".join(f"{component:g}" for component in lowest + 0.0)
             raise ProductError(f"{_place(dataset)}: the velocity is {value} everywhere; a flow that varies is needed")

@@ -172,7 +172,7 @@ class LagrangianModel(nn.Module):
             if any_rank(context.comm, not all(bool(torch.isfinite(value).all()) for value in given)):
                 raise TermError(f'term "{name}": its rates are not finite with the initial parameters; look for a '
                                 "division by zero, a root or a logarithm")
-            parameters = dict(term.named_parameters())
+            parameters = {key: parameter for key, parameter in term.named_parameters() if parameter.requires_grad}
             size = sum(value.abs().square().sum() for value in given if value.requires_grad)
             reached: Sequence[Tensor | None] = [None] * len(parameters)
             if parameters and isinstance(size, Tensor):

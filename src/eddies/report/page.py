@@ -124,12 +124,13 @@ def write_page(output: Path, run: RunRecord, sections: Sequence[Section], images
 
     Raises OSError, for example on a full disk. Then no file has changed.
     """
+    earlier = (output / "metrics.json").exists()  # figures of other programs stay
     (output / "figures").mkdir(parents=True, exist_ok=True)
     figures = {output / "figures" / f"{name}.png": image for name, image in images.items()}
     write_files({**figures, output / "index.html": render_page(run, sections, images),
                  output / "metrics.json": metrics_json(run.warnings, sections), **beside})
     for path in (output / "figures").glob("*.png"):
-        if path not in figures:
+        if earlier and path not in figures:
             path.unlink()
 
 

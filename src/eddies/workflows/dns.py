@@ -17,7 +17,9 @@ from eddies.io.checkpoint import Guard
 from eddies.io.fields import FieldWriter
 from eddies.io.frame_segments import FrameSegments
 from eddies.io.hdf5 import File, ProductError, create_product, open_product, write_attributes, write_table
+from eddies.io.provenance import product_provenance
 from eddies.io.trajectories import Trajectory
+from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
 from eddies.pipeline import STAGES
@@ -52,7 +54,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     saved, fluid = guard.checkpoints.newest(), build_fluid(scene.flow, scene.forcing, comm)
     if saved is not None and saved["phase"] == "tracers" and not saved.files and not holds_frames(
             comm, product, saved["frames"]):
-        log.warning("%s: lacks the frames before the checkpoint, which is not used", product)
+        if comm.rank == 0:
+            log.warning("%s: lacks the frames before the checkpoint, which is not used", product)
         guard.checkpoints.remove()
         saved = None
     state = initial_state(scene.initial, scene.seed, fluid) if saved is None else None
@@ -63,6 +66,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         flow.load_state_dict(saved)
         log.info("dns: continues from step %d, time %.4g", flow.clock.steps, flow.clock.time)
     provenance = {**stage_provenance(scene, "dns"), "course": course, "duration": scene.duration}
+    origin = on_first_rank(comm, lambda: product_provenance(product))
+    if saved is not None and scene.tracers is not None and origin.get("course") == course:
+        provenance["id"] = origin["id"]  # its frames stay, and so does what was made from them
     with create_product(comm, product, "ground_truth", provenance) as file:
         if saved is None:
             flow.history.sample(flow.state, flow.clock)
@@ -89,7 +95,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 write_attributes(file.create_group("forcing"), asdict(scene.forcing))
             tracers.write_spectra(file)
         else:
-            if flow.phase == "run" and flow.clock.time > flow.began + scene.time.duration:
+            if flow.phase == "run" and flow.clock.time > flow.began + scene.time.duration * (1 + 1e-9):
                 raise too_late(guard, f"[time] duration = {scene.time.duration:g}")
             run_for(flow, scene.time.duration, partial(check_span, scene.time))
             final = flow.state_dict()

@@ -19,7 +19,7 @@ from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows.foreseen.storage import in_units
-from eddies.workflows.run_directory.fingerprints import stage_fingerprint
+from eddies.workflows.run_directory.fingerprints import course_fingerprint, stage_fingerprint
 from eddies.workflows.run_directory.work import changed_settings, of_other_settings, stage_seconds
 from eddies.workflows.variants import Step, steps
 
@@ -132,8 +132,9 @@ def stage_state(name: str, step: Step) -> str:
         checkpoints = checkpoints_in(step.directory / stage.checkpoints) if stage.checkpoints else []
     except ProductError as error:
         return str(error)
-    if checkpoints:
-        fits = settings in [fingerprint for _, fingerprint in checkpoints]
+    continued = course_fingerprint(scene) if name == "dns" else settings
+    if checkpoints and origin.get("course") not in [fingerprint for _, fingerprint in checkpoints]:
+        fits = continued in [fingerprint for _, fingerprint in checkpoints]
         return f"stopped at step {checkpoints[0][0]}, {'can continue' if fits else 'with other settings'}"
     if product.is_file():
         if not origin:

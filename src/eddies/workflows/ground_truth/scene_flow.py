@@ -118,7 +118,7 @@ def _state_from_file(initial: Initial, fluid: Fluid) -> np.ndarray:
     solenoidal = grid.solenoidal(velocity)
     if foreign:
         kept, all_of_it = (grid.sum_modes(np.square(np.abs(part)).sum(axis=0)) for part in (solenoidal, velocity))
-        removed = 1 - kept / all_of_it if all_of_it else 0.0
+        removed = max(1 - kept / all_of_it, 0.0) if all_of_it else 0.0
         log.info("dns: the velocity in %s has %.3g %% of its energy in a part with divergence, which is removed",
                  initial.path, 100 * removed)
         if removed > MOST_REMOVED and comm.rank == 0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,8 +54,9 @@ class Work:
                               "--output")
 
 
-def find_work(stages: Sequence[str], scene: Scene, directory: Path) -> Work:
-    """The work that stages of a scene find in a locked run directory; on one rank.
+def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Collection[str] = ()) -> Work:
+    """The work that stages of a scene find in a locked run directory; on one rank. The products of `links` are those of
+    other directories.
 
     Raises ProductError if the system refuses to read a product or a checkpoint, which may be sound.
     """
@@ -73,7 +74,7 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path) -> Work:
             if not of_others and stage.name != "dns":
                 useless.add(stage.name)
             continue
-        same_course = checkpoints and not of_others and origin.get("course") == continued
+        same_course = checkpoints and not of_others and origin.get("course") == continued and stage.name not in links
         if same_course and origin["duration"] > scene.duration:
             useless.add(stage.name)  # the checkpoint is too late
         elif same_course:
