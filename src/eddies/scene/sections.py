@@ -12,7 +12,7 @@ from eddies.import_path import is_path, load
 from eddies.pipeline import STAGES
 from eddies.scene.integrators import SCHEMES, Scheme
 from eddies.scene.rules import quoted
-from eddies.scene.values import (SceneError, Section, boolean, choice, integer, integers, named, number,
+from eddies.scene.values import (SceneError, Section, boolean, choice, expanded, integer, integers, named, number,
                                  product_file, section, text, texts)
 
 BOX_LENGTH = 2 * math.pi
@@ -100,7 +100,7 @@ class Initial(Section):
         """The file to start from; of a run directory, its ground truth."""
         if self.path is None:
             return None
-        path = Path(self.path).expanduser()
+        path = expanded(self.path)
         return path / STAGES["dns"].file if path.is_dir() else path
 
     @property

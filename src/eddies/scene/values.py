@@ -245,10 +245,18 @@ def import_paths(part: Section) -> Iterator[tuple[str, str]]:
                         if ":" in path)
 
 
+def expanded(path: str) -> Path:
+    """Return a path with the home directory in place of `~`, unless that is unknown."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:  # no such user
+        return Path(path)
+
+
 def product_file(path: str, stage: str) -> Path:
     """Return the file of a stage's product that a key names: the path itself if it ends in .h5, else in this run
     directory."""
-    file = Path(path).expanduser()
+    file = expanded(path)
     return file if path.endswith(".h5") else file / STAGES[stage].file
 
 

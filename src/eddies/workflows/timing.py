@@ -69,6 +69,8 @@ def run(scene: Scene, comm: Comm, signals: Sequence[int] = ()) -> None:
             if scene.tracers:  # a single interval of frames tells how fast the flow turns over
                 with quiet():
                     dns.run(few.without_variants, comm, directory, stop)
+                # The measured run must not continue this one.
+                in_files(comm, directory, lambda: shutil.rmtree(directory / STAGES["dns"].checkpoints))
                 reference = product_attributes(directory / STAGES["dns"].file, "reference")
                 few = shortened(scene, reference["eddy_turnover_time"])
             for step in steps(few, scene.stages_of_all, directory):

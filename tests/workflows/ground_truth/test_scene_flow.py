@@ -226,4 +226,5 @@ def test_files_are_searched_beside_the_scene_too(tmp_path, monkeypatch):
     (tmp_path / "start.h5").touch()
     assert load_scene(scene).initial.file == Path("start.h5")
     assert load_scene(scene, ["initial.path=~/start.h5"]).initial.file == tmp_path / "start.h5"
+    assert load_scene(scene, ["initial.path=~nobody-here/a.h5"]).initial.file == Path("~nobody-here/a.h5")
     assert load_scene(scene, ["initial.path=case"]).initial.file == Path("case/ground_truth.h5")
