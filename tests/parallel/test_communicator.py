@@ -26,4 +26,4 @@ def test_ranks_without_processors_for_their_threads_get_a_warning(comm, monkeypa
     if comm.rank > 0 or own is None:
         assert lines == []
     else:
-        assert len(lines) == 1 and f"OMP_NUM_THREADS = {number}, but processors of a rank: {own}; " in lines[0]
+        assert len(lines) == 1 and f"{number} exceeds the number of processors of a rank, {own}, " in lines[0]

@@ -32,7 +32,7 @@ def warn_of_few_processors(comm: Comm) -> None:
         together = within_quota(set().union(*node.allgather(processors())))
         own, number = max(min(within_quota(processors()), together // node.size), 1), threads()
     if comm.rank == 0 and 1 < number > own:
-        log.warning("OMP_NUM_THREADS = %d, but processors of a rank: %d; threads on one processor slow each other "
+        log.warning("OMP_NUM_THREADS = %d exceeds the number of processors of a rank, %d, so threads slow each other "
                     "down; set it to %d, start fewer ranks, or bind each rank to %d processors (mpirun --map-by "
                     "slot:PE=%d)", number, own, own, number, number)
 

@@ -108,12 +108,14 @@ class Context:
     @property
     def everywhere(self) -> Context:
         """The same context for all owned particles instead of some rows."""
-        if self.rows is None:
-            return self
-        whole = copy(self)
-        whole.rows, whole._sums = None, {}
-        vars(whole).pop("moments", None)
-        return whole
+        return self if self.rows is None else self.of_rows(None)
+
+    def of_rows(self, rows: Tensor | None) -> Context:
+        """The same context for other rows of the owned particles; None: all."""
+        other = copy(self)
+        other.rows, other._sums = rows, {}
+        vars(other).pop("moments", None)
+        return other
 
     def column(self, name: str) -> Tensor:
         """Column "velocity" (s, 3) or "density" (s,) of the particles that this rank sees, owned first; collective."""

@@ -34,6 +34,8 @@ FORCING = "injection"
 # What a term must declare to return a rate. Pressure modes are ignored unless a term reads the density.
 GIVES_OF = {"acceleration": "acceleration", "force_modes": "acceleration", "density": "density",
             "density_rate": "density_rate", "shift_velocity": "shift_velocity", "shift_acceleration": "shift_velocity"}
+# Particles of a rank for which the effect of parameters is looked for: a gradient of all pairs takes much memory.
+CHECKED = 64
 # The rates that a linear term stores.
 STORED = (*BY_PARTICLE, "density")
 
@@ -157,25 +159,31 @@ class LagrangianModel(nn.Module):
         """
         columns = list(context.particles.columns().values())
         before = [column.clone() for column in columns]
+        few = context.of_rows(torch.arange(min(len(context.particles), CHECKED), device=columns[0].device))
         if self.density_is_given:
-            self.rates(context)  # gives the density that some terms read
+            with torch.no_grad():
+                self.rates(context)
+            few.density = context.density  # which some terms read
         for name, term in self.terms.items():
             for column, values in zip(columns, before):
                 if not torch.equal(column, values):
                     column.copy_(values)
             context.forget_sums(term)
-            rates = _evaluated(term, context)
+            with torch.no_grad():
+                given = [value for value in vars(_evaluated(term, context)).values() if value is not None]
             if any_rank(context.comm, not all(map(torch.equal, columns, before))):
                 raise TermError(f'term "{name}": changes the particles in place; work on a copy, such as '
                                 "context.particles.velocity.clone()")
-            given = [value for value in vars(rates).values() if value is not None]
             if any_rank(context.comm, not all(bool(torch.isfinite(value).all()) for value in given)):
                 raise TermError(f'term "{name}": its rates are not finite with the initial parameters; look for a '
                                 "division by zero, a root or a logarithm")
             parameters = {key: parameter for key, parameter in term.named_parameters() if parameter.requires_grad}
-            size = sum(value.abs().square().sum() for value in given if value.requires_grad)
+            if not parameters:
+                continue
+            size = sum(value.abs().square().sum() for value in vars(_evaluated(term, few)).values()
+                       if value is not None and value.requires_grad)
             reached: Sequence[Tensor | None] = [None] * len(parameters)
-            if parameters and isinstance(size, Tensor):
+            if isinstance(size, Tensor):
                 reached = torch.autograd.grad(size, list(parameters.values()), allow_unused=True)
             for parameter, gradient in zip(parameters, reached):
                 if not any_rank(context.comm, gradient is not None):

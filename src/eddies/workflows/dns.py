@@ -52,8 +52,10 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     product, course = directory / STAGES["dns"].file, course_fingerprint(scene)
     guard = Guard(comm, directory / STAGES["dns"].checkpoints, course, stop)
     saved, fluid = guard.checkpoints.newest(), build_fluid(scene.flow, scene.forcing, comm)
-    if saved is not None and saved["phase"] == "tracers" and not saved.files and not holds_frames(
-            comm, product, saved["frames"]):
+    origin = on_first_rank(comm, lambda: product_provenance(product))
+    same_course = saved is not None and origin.get("course") == course
+    if saved is not None and saved["phase"] == "tracers" and not saved.files and not (
+            same_course and holds_frames(comm, product, saved["frames"])):
         if comm.rank == 0:
             log.warning("%s: lacks the frames before the checkpoint, which is not used", product)
         guard.checkpoints.remove()
@@ -66,8 +68,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         flow.load_state_dict(saved)
         log.info("dns: continues from step %d, time %.4g", flow.clock.steps, flow.clock.time)
     provenance = {**stage_provenance(scene, "dns"), "course": course, "duration": scene.duration}
-    origin = on_first_rank(comm, lambda: product_provenance(product))
-    if saved is not None and scene.tracers is not None and origin.get("course") == course:
+    if same_course and saved is not None and scene.tracers is not None:
         provenance["id"] = origin["id"]  # its frames stay, and so does what was made from them
     with create_product(comm, product, "ground_truth", provenance) as file:
         if saved is None:
@@ -121,7 +122,8 @@ def holds_frames(comm: Comm, product: Path, count: int) -> bool:
 
 def too_late(guard: Guard, key: str) -> SceneError:
     """The error of a checkpoint that is later than the end of the run."""
-    return SceneError(f"{key}: the checkpoint in {guard.checkpoints.path} is later; raise it, or remove that directory")
+    return SceneError(f"{key}: the checkpoint in {guard.checkpoints.path} is later; raise the key, or remove that "
+                      "directory to simulate from the beginning")
 
 
 def run_for(flow: FlowRun, duration: float, check: SpanCheck) -> None:
