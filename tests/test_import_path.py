@@ -23,11 +23,13 @@ def test_the_class_of_a_path_and_its_origin(own):
     ("own_hungry:Thing", 'there is no module "own_missing", which it imports'),
     ("own_empty:Thing", '"own_empty:Thing": own_empty has no Thing'),
     ("own_broken:Thing", "importing own_broken fails: ZeroDivisionError: division by zero"),
+    ("own_ending:Thing", "importing own_ending fails: SystemExit: 3"),
 ])
 def test_bad_path(own, path, message):
     own("own_empty", "")
     own("own_hungry", "import own_missing\n")
     own("own_broken", "1 / 0\n")
+    own("own_ending", "raise SystemExit(3)\n")
     with pytest.raises(ImportPathError) as error:
         load(path)
     assert message in str(error.value)

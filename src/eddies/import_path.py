@@ -53,7 +53,7 @@ def load(path: str) -> Any:
         importer = "" if error.name == module_name else ", which it imports"
         raise ImportPathError(f'"{path}": there is no module "{error.name}"{importer}; put it beside the scene, into '
                               "the working directory, or into a folder of PYTHONPATH") from None
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # a user's code may raise anything
         raise ImportPathError(f'"{path}": importing {module_name} fails: {type(error).__name__}: {error}') from error
     if not hasattr(module, name):
         raise ImportPathError(f'"{path}": {module_name} has no {name}')
@@ -70,7 +70,7 @@ def users_code(called: Any, problem: type[UserError], hint: str = "") -> Iterato
         yield
     except (UserError, MemoryError):
         raise
-    except Exception as error:  # a user's code may raise anything
+    except (Exception, SystemExit) as error:
         module = getattr(called, "__module__", None) or "builtins"
         if __package__ in (module.partition(".")[0], type(error).__module__.partition(".")[0]):
             raise

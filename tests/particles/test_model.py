@@ -1,6 +1,7 @@
 """A model is a list of terms: inputs, contributions, stored linear terms, and errors."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -166,7 +167,8 @@ def test_a_term_that_contradicts_its_declaration_is_named(comm):
             (lambda context: Rates(acceleration=velocity.numpy()), ("acceleration",), "a ndarray; it must be"),
             (lambda context: Rates(density_rate=velocity[:, 0]), ("acceleration",), 'add "density_rate" to `gives`'),
             (lambda context: Rates(acceleration=velocity[count]), ("acceleration",),
-             r"configurations.py, line \d+: IndexError: index")):
+             r"configurations.py, line \d+: IndexError: index"),
+            (lambda context: sys.exit(4), ("acceleration",), r"line \d+: SystemExit: 4")):
         with pytest.raises(TermError, match=f"Given: .*{complaint}"):
             dynamics_of(slab, of_terms(Given(function, gives=gives))).rates(particles)
     with pytest.raises(TermError, match=r"Term: has no forward\(context\)"):

@@ -353,5 +353,5 @@ def _build_term(path: str, settings: TermSettings, flow: FlowUnits) -> Term:
         return kind(settings, flow).double()
     except UserError as error:
         raise TermError(f'term "{path}": {error}') from error
-    except Exception as error:  # a user's class may raise anything
+    except (Exception, SystemExit) as error:  # a user's class may raise anything
         raise TermError(f'term "{path}": cannot be made: {type(error).__name__}: {error}') from error

@@ -27,7 +27,7 @@ from eddies.scene.scene import (BOX_LENGTH, Flow, Forcing, Initial, Model, Scene
 from eddies.scene.terms import StepUnits
 from eddies.workflows.foreseen.numbers import Estimates, Turbulence, estimate
 from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
-from eddies.workflows.foreseen.storage import disk, in_units, memory, most_disk
+from eddies.workflows.foreseen.storage import Disk, disk, in_units, memory, most_disk
 from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.ground_truth.scene_flow import stored_states
 from eddies.workflows.variants import Step, steps
@@ -132,7 +132,7 @@ def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]
     limits = most_ranks(scene.ground_truth_alone if set(stages) == {"dns"} else scene)
     yield from rank_problems(limits, comm.size)
     if has_single_writer(comm):
-        yield from _large_files({stage: disk(scene, stage).kept or 0.0 for stage in stages}, comm.size)
+        yield from _large_files({stage: disk(scene, stage) for stage in stages}, comm.size)
 
 
 def _strong_forcing(initial: Initial, forcing: Forcing, time: Time) -> Iterator[str]:
@@ -197,10 +197,10 @@ def _too_few_frames(step: Step, turbulence: Turbulence, made: Collection[Path]) 
                    f"{error}")
 
 
-def _large_files(sizes: Mapping[str, float], ranks: int) -> Iterator[str]:
+def _large_files(needs: Mapping[str, Disk], ranks: int) -> Iterator[str]:
     """Products that are too large for rank 0 to write for all."""
-    for stage, size in sizes.items():
-        if size > LARGEST_BYTES:
+    for stage, needed in needs.items():
+        if (size := (needed.kept or 0.0) - needed.beside) > LARGEST_BYTES:
             yield (f"{STAGES[stage].file}: this h5py is built without MPI, so that rank 0 writes for {ranks} ranks, up "
                    f"to {in_units(LARGEST_BYTES)} a file, and this will take {in_units(size)}; {REMEDY}")
 

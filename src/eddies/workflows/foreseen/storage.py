@@ -61,11 +61,12 @@ def flow_memory(flow: Flow, tracers: Tracers | None, ranks: int) -> float:
 
 
 class Disk(NamedTuple):
-    """Bytes that a stage leaves in the run directory, None where they are unknown, and those of files that it removes
-    at its end."""
+    """Bytes that a stage leaves in the run directory, None where they are unknown, those of files that it removes at
+    its end, and those that it leaves in other files than its product."""
 
     kept: float | None
     scratch: float = 0.0
+    beside: float = 0.0
 
 
 def disk(scene: Scene, stage: str) -> Disk:
@@ -75,15 +76,14 @@ def disk(scene: Scene, stage: str) -> Disk:
         k_max, intervals = flow.largest_wavenumber, expected.frame_intervals
         statistics = (SAMPLE_BYTES + 8 * (math.ceil(math.sqrt(3) * k_max) + 1)) * ((expected.steps or 0) // EVERY)
         state = flow.components * (2 * k_max + 1) ** 2 * (k_max + 1) * 2 * flow.real_bytes
-        statistics += state           # the last one stays
-        checkpoints = KEPT * state    # with the one that is written
+        checkpoints = KEPT * state    # with the one that is written; the last one stays
         if tracers is None:
-            return Disk(statistics + 4 * flow.components * flow.cells**3, checkpoints)
+            return Disk(state + statistics + 4 * flow.components * flow.cells**3, checkpoints, state)
         during, after = (
             trajectory_bytes(flow, tracers, frames,
                              len(whole_frames(scene.simulation, scene.training, tracers.field_every, frames)))
             for frames in (intervals or 0, (intervals or 0) + 1))
-        return Disk(None if intervals is None else statistics + after, checkpoints + during)
+        return Disk(None if intervals is None else state + statistics + after, checkpoints + during, state)
     if stage == "train-kernel":  # planes of five reconstructions, velocity and gradient
         return Disk(PRODUCT_BYTES + 80 * tracers.cells**2 + 64 * scene.kernel.steps)
     if stage == "train":         # samples of rates, and the history

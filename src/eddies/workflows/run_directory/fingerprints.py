@@ -39,6 +39,8 @@ def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> 
         "found_step": _digest(simulation.step_file if simulation else None),
         "confirming": _fingerprints(simulation.confirming_files if simulation else ())}
     # The content of these files counts, not their paths.
+    if settings["start"] is not None:
+        del settings["initial"]["path"]
     if settings["weights"] is not None:
         del settings["model"]["path"]
     if settings["found_step"] is not None:
