@@ -12,6 +12,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from eddies.clock import duration
 from eddies.errors import UserError
@@ -38,11 +39,10 @@ from eddies.workflows.variants import Step, steps
 
 log = logging.getLogger("eddies")
 
-# The functions of the stages, each run(scene, comm, directory, stop). A module is imported when its stage runs.
-RUN = {"dns": "eddies.workflows.dns:run", "train-kernel": "eddies.workflows.train_kernel:run",
-       "train": "eddies.workflows.train:run", "find-step": "eddies.workflows.find_step:run",
-       "simulate": "eddies.workflows.simulate:run",
-       "report": "eddies.workflows.report:run_stage"}
+# The modules of the stages, imported when their stage runs: run(directory, comm, variants, stop) of the report,
+# run(scene, comm, directory, stop) of the others.
+MODULES = {"dns": "dns", "train-kernel": "train_kernel", "train": "train", "find-step": "find_step",
+           "simulate": "simulate", "report": "report"}
 
 
 class VariantsFailed(UserError):
@@ -102,7 +102,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
             log.warning(warning)
         failures = run_steps(planned, comm, directory, stop, overwrite, take_over)
         if reported:
-            run_stage("report", scene, comm, directory, stop, False, variants=variants)
+            run_stage("report", (directory, comm, variants, stop), comm, directory, stop, False)
     if failures:
         raise VariantsFailed(f"{scene.name}: variants failed: " + "; ".join(
             f"{name} ({failure})" for name, failure in failures.items()))
@@ -164,7 +164,7 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
         if "dns" in stage.depends_on and not checked:
             check_ground_truth(step.stages[number:], scene, comm, directory)
             checked = True
-        run_stage(name, scene, comm, directory, stop, name in work.begun)
+        run_stage(name, (scene, comm, directory, stop), comm, directory, stop, name in work.begun)
 
 
 def look_at_work(step: Step, comm: Comm, overwrite: bool) -> Work:
@@ -183,17 +183,16 @@ def working_in(comm: Comm, directory: Path, stop: StopRequest, take_over: bool) 
         yield
 
 
-def run_stage(name: str, scene: Scene, comm: Comm, directory: Path, stop: StopRequest, begun: bool,
-              **more: Sequence[str]) -> None:
-    """Run one stage and record its wall time, also if it is stopped. If it had `begun` before, times are added.
-    `more` are further arguments of the stage."""
+def run_stage(name: str, arguments: Sequence[Any], comm: Comm, directory: Path, stop: StopRequest,
+              begun: bool) -> None:
+    """Run one stage with its arguments and record its wall time, also if it is stopped. If it had `begun` before, times
+    are added."""
     log.info("%s: starts on %d %s", name, comm.size, "rank" if comm.size == 1 else "ranks")
     start = time.perf_counter()
-    module, _, function = RUN[name].partition(":")
-    run = getattr(import_module(module), function)
+    run = import_module(f"eddies.workflows.{MODULES[name]}").run
     stop.check()
     try:
-        run(scene, comm, directory, stop, **more)
+        run(*arguments)
         comm.Barrier()
     except Stopped:
         record_seconds(name, time.perf_counter() - start, comm, directory, begun)

@@ -18,7 +18,6 @@ from eddies.scene.scene import load_scene
 from eddies.workflows import dns, report
 from eddies.workflows.rollout.measured import open_rollout
 from tests.changed_product import changed
-from tests.small_scene import TINY
 from tests.workflows.stopping import StopAtStep
 from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_model, write_rollout, write_run
 
@@ -467,10 +466,10 @@ def test_an_empty_directory_is_refused(comm, tmp_path):
 def test_a_report_can_be_stopped_before_and_after_its_figures_are_drawn(comm, tmp_path, looks):
     write_ground_truth(comm, tmp_path, tracers=False)
     with pytest.raises(Stopped):
-        report.run_stage(load_scene(TINY), comm, tmp_path, StopAtStep(comm, looks))
+        report.run(tmp_path, comm, stop=StopAtStep(comm, looks))
     comm.Barrier()
     assert not (tmp_path / "report").exists()
-    report.run_stage(load_scene(TINY), comm, tmp_path, StopAtStep(comm, 2))
+    report.run(tmp_path, comm, stop=StopAtStep(comm, 2))
     comm.Barrier()
     assert (tmp_path / "report/index.html").exists()
 

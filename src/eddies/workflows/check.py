@@ -47,8 +47,14 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
     expected, tracers, k_max = estimate(scene), scene.tracers, scene.flow.largest_wavenumber
     rollout_of = {name: estimate(each).rollout for name, each in (scene.variant or {scene.name: scene}).items()}
     context = here(scene.stages_of_all, scene.directory, comm)
-    (refusals, warnings), limits, work = problems(scene, context), most_ranks(scene), work_of(scene)
-    turbulence = expected.turbulence
+    (refusals, warnings), limits, turbulence = problems(scene, context), most_ranks(scene), expected.turbulence
+    # The scenes of each stage by variant (None: shared by all) and stage; several with realisations.
+    work: dict[tuple[str | None, str], list[Scene]] = {}
+    planned = steps(scene, scene.stages_of_all, scene.directory)
+    for step in sorted(planned, key=lambda step: [None, *scene.variant].index(step.variant)):
+        for stage in step.stages:
+            work.setdefault((step.variant, stage), []).append(step.scene)
+    work[None, "report"] = [place.scene for places in rollouts(scene, scene.directory).values() for place in places]
     costs = [cost(variant, stage, scenes, comm.size) for (variant, stage), scenes in work.items()]
     return {
         "scene": scene.name, "stages": list(scene.stages_of_all), "cells": scene.flow.cells,
@@ -69,17 +75,6 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
                    "most_disk": most_disk(disk(each, stage) for (_, stage), scenes in work.items() for each in scenes)},
         "warnings": warnings, "refusals": refusals,
     }
-
-
-def work_of(scene: Scene) -> dict[tuple[str | None, str], list[Scene]]:
-    """The scenes of each stage by variant (None: shared by all) and stage; several with realisations."""
-    work: dict[tuple[str | None, str], list[Scene]] = {}
-    planned = steps(scene, scene.stages_of_all, scene.directory)
-    for step in sorted(planned, key=lambda step: [None, *scene.variant].index(step.variant)):
-        for stage in step.stages:
-            work.setdefault((step.variant, stage), []).append(step.scene)
-    work[None, "report"] = [place.scene for places in rollouts(scene, scene.directory).values() for place in places]
-    return work
 
 
 def cost(variant: str | None, stage: str, scenes: Sequence[Scene], ranks: int) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from eddies.workflows.ground_truth.flow_run import FlowRun, TracerRun, frame_lay
 from eddies.workflows.ground_truth.frame_counts import whole_frames
 from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
 from eddies.workflows.problems import check_span
-from eddies.workflows.run_directory.fingerprints import course_fingerprint, stage_provenance
+from eddies.workflows.run_directory.fingerprints import DURATIONS, stage_fingerprint, stage_provenance
 
 log = logging.getLogger("eddies")
 
@@ -49,7 +49,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     requests it.
     """
     directory = Path(directory)
-    product, course = directory / STAGES["dns"].file, course_fingerprint(scene)
+    product, course = directory / STAGES["dns"].file, stage_fingerprint(scene, "dns", DURATIONS["dns"])
     guard = Guard(comm, directory / STAGES["dns"].checkpoints, course, stop)
     saved, fluid = guard.checkpoints.newest(), build_fluid(scene.flow, scene.forcing, comm)
     origin = on_first_rank(comm, lambda: product_provenance(product))

@@ -85,7 +85,8 @@ def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
     refused: dict[str, None] = {}
     doubts: dict[str, list[str]] = {}
     for step in planned:
-        refused |= dict.fromkeys(_refusals(step, comm, made))
+        refused |= dict.fromkeys(f"{step.scene.name}: {problem}" for problem in _infeasible(step, comm, made))
+        refused |= dict.fromkeys([*place_problems(step.stages, comm, step.directory), *_unfit_files(step, comm, made)])
         for doubt in _warnings(step, made):
             doubts.setdefault(doubt, []).append(step.variant or "")
         for stage in step.stages:
@@ -106,12 +107,6 @@ def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
 # ---- problems that end a run
 
 
-def _refusals(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
-    yield from (f"{step.scene.name}: {problem}" for problem in _infeasible(step, comm, made))
-    yield from place_problems(step.stages, comm, step.directory)
-    yield from _unfit_files(step, comm, made)
-
-
 def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
     """Yield unstable or decayed flows, too many steps, frames, ranks or bytes, and too few frames."""
     scene, stages, expected = step.scene, step.stages, estimate(step.scene)
@@ -127,8 +122,12 @@ def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]
             yield from _too_many_frames(tracers, tracers.turnovers * turbulence.turnover_time)
     if "simulate" in stages:
         yield from _too_many_rollout_steps(scene.simulation, turbulence.turnover_time if turbulence else 0.0)
-    if turbulence is not None:
-        yield from _too_few_frames(step, turbulence, made)
+    # The turnover time of a flow that decays before the tracers start, or is hardly turbulent, has no limit.
+    decays = scene.spin_up is not None and scene.forcing is None
+    if tracers is not None and turbulence is not None and turbulence.reynolds_lambda >= TURBULENT and (
+            not decays and step.holder("dns") / STAGES["dns"].file in made):
+        yield from _too_few_frames(tracers, turbulence.turnover_time, partial(
+            check_frames, stages, tracers, scene.own_training, scene.simulation, scene.seen_in(step.holder("dns"))))
     limits = most_ranks(scene.ground_truth_alone if set(stages) == {"dns"} else scene)
     yield from rank_problems(limits, comm.size)
     if has_single_writer(comm):
@@ -177,24 +176,14 @@ def _too_many(key: str, value: float | str, step: float, span: float) -> Iterato
                f"of {MOST_STEPS:.0e}; raise it, or lower the turnovers or the duration of the run")
 
 
-def _too_few_frames(step: Step, turbulence: Turbulence, made: Collection[Path]) -> Iterator[str]:
-    """Too few frames of a ground truth that this job makes, even with the longest possible turnover time.
-
-    The turnover time of a flow that decays before the tracers start, or is hardly turbulent, has no limit.
-    """
-    scene = step.scene
-    unsure = step.holder("dns") / STAGES["dns"].file not in made or scene.spin_up is not None and scene.forcing is None
-    if unsure or scene.tracers is None or turbulence.reynolds_lambda < TURBULENT:
-        return
-    longest = LATER * scene.tracers.turnovers * turbulence.turnover_time
-    frames = max(math.ceil(longest / scene.tracers.frame_interval), 1) + 1
+def _too_few_frames(tracers: Tracers, turnover_time: float, check: Callable[[int], None]) -> Iterator[str]:
+    """Too few frames for a `check` of their number, even with the longest possible turnover time."""
+    frames = max(math.ceil(LATER * tracers.turnovers * turnover_time / tracers.frame_interval), 1) + 1
     if frames <= MOST_STEPS:
         try:
-            check_frames(step.stages, scene.tracers, scene.own_training, scene.simulation,
-                         scene.seen_in(step.holder("dns")), frames)
+            check(frames)
         except SceneError as error:
-            yield (f"with at most {frames} frames, as expected of [tracers] turnovers = {scene.tracers.turnovers:g}: "
-                   f"{error}")
+            yield f"with at most {frames} frames, as expected of [tracers] turnovers = {tracers.turnovers:g}: {error}"
 
 
 def _large_files(needs: Mapping[str, Disk], ranks: int) -> Iterator[str]:

@@ -141,12 +141,6 @@ def _has_rollout(directory: Path) -> bool:
     return (directory / ROLLOUT).exists()
 
 
-def run_stage(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None,
-              variants: Sequence[str] = ()) -> None:
-    """Make the report as a stage of a scene."""
-    run(directory, comm, variants, stop)
-
-
 def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: StopRequest | None = None,
         output: Path | None = None) -> None:
     """Write report/index.html, report/figures/*.png and report/metrics.json of a run directory; all ranks call it.

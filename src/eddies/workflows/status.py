@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 from eddies.clock import duration
@@ -16,12 +17,12 @@ from eddies.io.provenance import product_provenance
 from eddies.io.run_lock import find_lock
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
-from eddies.pipeline import STAGES
+from eddies.pipeline import STAGES, Stage
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows.foreseen.storage import in_units
-from eddies.workflows.run_directory.fingerprints import course_fingerprint, stage_fingerprint
+from eddies.workflows.run_directory.fingerprints import DURATIONS, stage_fingerprint
 from eddies.workflows.run_directory.work import changed_settings, of_other_settings, stage_seconds
-from eddies.workflows.variants import Step, steps
+from eddies.workflows.variants import steps
 
 SCENE, PAGE = "scene.toml", Path("report") / "index.html"
 
@@ -108,8 +109,10 @@ def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
         seconds, prefix = stage_seconds(step.directory), ""
         if step.directory != directory:
             prefix = f"{step.directory.relative_to(directory)}: "
-        rows += [(prefix + name, seconds.get(name), stage_state(name, step))
-                 for name in step.stages if name in step.scene.stages]
+        own, text = partial(stage_fingerprint, step.scene), step.scene.to_toml()
+        rows += [(prefix + name, seconds.get(name), stage_state(
+            STAGES[name], step.directory, own(name), own(name, DURATIONS.get(name, ())), text))
+            for name in step.stages if name in step.scene.stages]
     page, products = directory / PAGE, [step.directory / STAGES[name].file for step in planned for name in step.stages]
     state = "to do"
     if page.is_file():
@@ -121,23 +124,24 @@ def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
         yield f"  {title:{width}}  {'' if seconds is None else duration(seconds):>12}  {state}".rstrip()
 
 
-def stage_state(name: str, step: Step) -> str:
-    """The state of a stage of a step in words."""
-    stage, scene = STAGES[name], step.scene
-    product = step.directory / stage.file
-    settings, origin = stage_fingerprint(scene, name), product_provenance(product)
+def stage_state(stage: Stage, directory: Path, settings: str, continued: str, scene: str) -> str:
+    """The state of a stage in a directory in words.
+
+    `settings` and `continued` are the fingerprints of the stage and of what it can continue, `scene` the scene's text.
+    """
+    product = directory / stage.file
+    origin = product_provenance(product)
     if origin.get("fingerprint") == settings:
         return f"complete, {in_units(product.stat().st_size)}"
     try:
-        checkpoints = checkpoints_in(step.directory / stage.checkpoints) if stage.checkpoints else []
+        checkpoints = checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
     except ProductError as error:
         return str(error)
-    continued = course_fingerprint(scene) if name == "dns" else settings
     if checkpoints and origin.get("course") not in [fingerprint for _, fingerprint in checkpoints]:
         fits = continued in [fingerprint for _, fingerprint in checkpoints]
         return f"stopped at step {checkpoints[0][0]}, {'can continue' if fits else 'with other settings'}"
     if product.is_file():
         if not origin:
             return "damaged, unfinished or of another version"
-        return "made with " + of_other_settings(changed_settings(stage, origin.get("scene"), scene.to_toml()))
+        return "made with " + of_other_settings(changed_settings(stage, origin.get("scene"), scene))
     return "to do"

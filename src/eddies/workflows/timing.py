@@ -40,7 +40,7 @@ from eddies.workflows.variants import steps
 log = logging.getLogger("eddies")
 
 RUN = {"dns": dns.run, "train-kernel": train_kernel.run, "train": train.run, "find-step": find_step.run,
-       "simulate": simulate.run, "report": report.run_stage}
+       "simulate": simulate.run}
 FEW = 4                      # steps of a training, and intervals of a rollout
 A_MOMENT = 1e-9              # turnovers of a spin-up or ground truth of as few steps as possible
 
@@ -83,7 +83,7 @@ def run(scene: Scene, comm: Comm, signals: Sequence[int] = ()) -> None:
                         failed.add(step.variant)
             if "report" in scene.stages_of_all:
                 in_files(comm, directory, lambda: write_files({directory / "scene.toml": few.to_toml()}))
-                measured("report", partial(wall_time_of, "report", few, scene, directory, stop))
+                measured("report", lambda: (elapsed(comm, lambda: report.run(directory, comm, stop=stop)), 0.0, 0))
     except Stopped:
         raise Stopped(stop.reason, "from the beginning") from None
 
@@ -125,8 +125,6 @@ def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
         definition, device = ModelDefinition.of(few), prepare_torch(whole.device, comm)
         rest, number, step = rest_of_training(definition, few.training, whole.training.frames, directory, device, stop)
         return seconds + rest, step, number
-    if stage == "report":
-        return seconds, 0.0, 0
     if stage == "find-step":  # here its rollouts are one interval long
         span = expected.rollout.turnover_time * find_step.TURNOVERS if expected.rollout else 0.0
         return seconds * max(round(span / whole.simulation.frame_interval), 1), 0.0, 0 if expected.rollout else None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +36,8 @@ THROUGH_KERNEL = ("qr_kl", "qr_kl_floor")  # measured on gradients that the smoo
 COLUMNS = ("name", "label", "method", "kind", "on_grid", "status", "stopped_at", "realisations", *MEASURES, "end",
            *COST, *BEFORE, *(f"{measure}_spread" for measure in MEASURES), "settings")
 MODEL, ROLLOUT = STAGES["train"].file, STAGES["simulate"].file
+# Numbers of THROUGH_KERNEL cannot be compared between scenes whose kernels differ.
+_kernel_of = partial(stage_fingerprint, stage="train-kernel")
 
 
 def row(scene: Scene, name: str, places: Sequence[Place], realised: Sequence[Mapping[str, Any]],
@@ -51,8 +54,9 @@ def row(scene: Scene, name: str, places: Sequence[Place], realised: Sequence[Map
               "settings": "; ".join(scene.differences(name)) if scene.variant else ""}
     if realised:
         found |= together(realised)
-        found |= before(places[0], alone)
-        if has_own_kernel(scene, variant):
+        first, own = places[0].directory, places[0].scene
+        found |= before(first / MODEL if own.needs_model else None, step_path(own.simulation, first), alone)
+        if _kernel_of(variant) != _kernel_of(scene.without_variants):
             found |= dict.fromkeys(THROUGH_KERNEL)
     else:
         found["status"] = why_not(next(place.directory for place in places
@@ -89,30 +93,22 @@ def together(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def before(place: Place, alone: Comm) -> dict[str, Any]:
-    """Return the numbers of BEFORE that are stored with the weights of the model and with the step."""
+def before(model: Path | None, step: Path | None, alone: Comm) -> dict[str, Any]:
+    """Return the numbers of BEFORE that are stored in the files of the model and of the step."""
     found: dict[str, Any] = {}
-    path = place.directory / MODEL
-    if place.scene.needs_model and path.exists():
-        with open_product(alone, path, "model") as file:
+    if model is not None and model.exists():
+        with open_product(alone, model, "model") as file:
             phases = read_json(file, "description").get("training")
             found["weights"] = sum(dataset.size for dataset in file["weights"].values())
         if phases is not None:
             found["training_seconds"] = float(sum(phase["seconds"] for phase in phases))
             found["training_steps"] = sum(phase["steps"] for phase in phases)
-    path = step_path(place.scene.simulation, place.directory)
-    if path is not None and path.exists():
-        step, tried = read_found_step(path, alone)
-        twice = tried["error"][np.isclose(tried["size"], 2 * step["size"])]
-        found |= zip(SEARCH, (step["integrator"], step["size"], step["seconds"], step["error"],
-                              step["error_with_half"], float(twice[0]) if len(twice) else None))
+    if step is not None and step.exists():
+        chosen, tried = read_found_step(step, alone)
+        twice = tried["error"][np.isclose(tried["size"], 2 * chosen["size"])]
+        found |= zip(SEARCH, (chosen["integrator"], chosen["size"], chosen["seconds"], chosen["error"],
+                              chosen["error_with_half"], float(twice[0]) if len(twice) else None))
     return found
-
-
-def has_own_kernel(scene: Scene, variant: Scene) -> bool:
-    """Return whether a variant and its scene have different smoothing kernels, so that the numbers of THROUGH_KERNEL
-    cannot be compared."""
-    return len({stage_fingerprint(each, "train-kernel") for each in (scene.without_variants, variant)}) > 1
 
 
 def notes(scene: Scene) -> list[str]:
@@ -121,7 +117,7 @@ def notes(scene: Scene) -> list[str]:
     found = [f"Mean and standard deviation over {len(seeds)} realisations, seeds {', '.join(map(str, seeds))}, that no "
              "training has seen." if seeds and len(seeds) > 1 else
              "All numbers are from one realisation, so small differences may be due to chance."]
-    own = [name for name, variant in variants.items() if has_own_kernel(scene, variant)]
+    own = [name for name, variant in variants.items() if _kernel_of(variant) != _kernel_of(scene.without_variants)]
     if own:
         blank = " and ".join(MEASURES[measure] for measure in THROUGH_KERNEL)
         found.append(f"{', '.join(own)}: no {blank}. These numbers need the smoothing kernel, and a kernel with other "

@@ -15,18 +15,12 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import FOREIGN_IN, Scene
 
 
-# The keys that only say how long the direct simulation goes on.
-DURATIONS = "tracers.turnovers", "time.duration"
-
-
-def course_fingerprint(scene: Scene) -> str:
-    """Return the SHA-256 of the inputs of the direct simulation, except how long it goes on. One of the same course can
-    be continued."""
-    return stage_fingerprint(scene, "dns", DURATIONS)
+# The keys of a stage that only say how long it goes on. One that differs in these alone can be continued.
+DURATIONS = {"dns": ("tracers.turnovers", "time.duration")}
 
 
 def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> str:
-    """Return the SHA-256 of the inputs of a stage's product, `without` some keys.
+    """Return the SHA-256 of the inputs of a stage's product, `without` some keys, such as the stage's DURATIONS.
 
     It covers the settings of the stage and of the scene's earlier stages, the content of the files that the flow, the
     weights and the step come from, the source of the user's classes, and the fingerprints of other ground truths.

@@ -24,7 +24,7 @@ from eddies.pipeline import STAGES, Stage
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Scene, Simulation
 from eddies.scene.sections import CONVERGED
-from eddies.workflows.run_directory.fingerprints import course_fingerprint, stage_fingerprint
+from eddies.workflows.run_directory.fingerprints import DURATIONS, stage_fingerprint
 
 SECONDS = "stage_seconds.json"
 FAILURE = "failure.txt"  # the error of a failed variant
@@ -65,7 +65,7 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
     for stage in [STAGES[name] for name in stages if STAGES[name].product is not None]:
         product, settings = directory / stage.file, stage_fingerprint(scene, stage.name)
         checkpoints = checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
-        continued = course_fingerprint(scene) if stage.name == "dns" else settings
+        continued = stage_fingerprint(scene, stage.name, DURATIONS.get(stage.name, ()))
         of_others = checkpoints and continued not in [fingerprint for _, fingerprint in checkpoints]
         origin = product_provenance(product)
         if origin.get("fingerprint") == settings:
