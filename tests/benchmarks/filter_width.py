@@ -1,14 +1,14 @@
 """Figure of the error over the filter width in Kolmogorov lengths, from the results of several comparisons.
 
     .venv/bin/python tests/benchmarks/filter_width.py docs/results/compare-small.json docs/results/compare-hit.json \
-        docs/results/compare-coarse.json docs/results/compare-256-32.json docs/results/compare-256.json \
-        docs/error-over-filter-width.png
+        docs/results/compare-coarse.json docs/results/compare-256.json docs/error-over-filter-width.png
 
 It shows the variants of the same names in all comparisons, and the best coarse grid: the one with the smallest error
 of those that take no longer than the learned model in the same run.
 """
 
 import json
+import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -22,10 +22,9 @@ from eddies.report.figures import DNS, FILTERED, FOURTH, MODEL, SECOND, THIRD, T
 
 DRAWN = ("velocity_error_half", "acceleration_kl")
 # Label, colour and marker of the variants.
-LOOKS = {"resolved": ("the resolved velocity", MODEL, "o"), "with-pairs": ("and pairs", SECOND, "^"),
-         "grid": ("best grid of its cost", TRUTH, "s"), "paper": ("the paper's form", THIRD, "D"),
-         "transport-velocity": ("transport-velocity SPH", FOURTH, "v"),
-         "local": ("all among neighbours", FILTERED, "P"), "no-force": ("no force", DNS, "x")}
+LOOKS = {"resolved": ("the resolved velocity", MODEL, "o"), "grid": ("best grid of its cost", TRUTH, "s"),
+         "paper": ("the published form", THIRD, "D"), "transport-velocity": ("transport-velocity SPH", FOURTH, "v"),
+         "local": ("only neighbours", SECOND, "P"), "no-force": ("no force", DNS, "x")}
 
 Row = Mapping[str, Any]
 
@@ -44,12 +43,15 @@ def best_grid(rows: Mapping[str, Row], measure: str) -> Row | None:
 
 
 def points(results: Iterable[Mapping[str, Any]], name: str, measure: str) -> list[tuple[float, float, float, str]]:
-    """d/eta, error, its spread and the name of the variant, for every comparison that has it."""
+    """d/eta, error, its spread and the name of the variant, for every comparison; the error is NaN where a comparison
+    lacks the variant or its rollout broke off."""
     found = []
     for result in results:
         rows = {row["name"]: row for row in result["rows"] if is_stable(row)}
         row = best_grid(rows, measure) if name == "grid" else rows.get(name)
-        if row is not None and row[measure] is not None:
+        if row is None or row[measure] is None:
+            found.append((width_of(result), math.nan, 0.0, name))
+        else:
             found.append((width_of(result), row[measure], row.get(f"{measure}_spread") or 0.0, row["name"]))
     return sorted(found)
 
@@ -61,9 +63,7 @@ def drawn(results: Sequence[Mapping[str, Any]]) -> Figure:
     figure.set_layout_engine("constrained")  # for labels and legends that are wide
     for axis, measure in zip(axes.flat, DRAWN):
         for name, (words, colour, marker) in LOOKS.items():
-            if not (line := points(results, name, measure)):
-                continue
-            width, error, spread, _ = zip(*line)
+            width, error, spread, _ = zip(*points(results, name, measure))
             axis.errorbar(width, error, [[min(s, 0.9 * e) for s, e in zip(spread, error)], spread], color=colour,
                           marker=marker, markersize=6, capsize=2, elinewidth=1, label=words)
         if f"{measure}_floor" in MEASURES:
@@ -71,8 +71,8 @@ def drawn(results: Sequence[Mapping[str, Any]]) -> Figure:
             axis.plot(width, floor, color=FILTERED, linestyle=":", label="two samples of the truth")
         axis.set(xscale="log", yscale="log", xlabel=r"width of the filter $d/\eta$",
                  ylabel=in_symbols(MEASURES[measure]))
-        ticks = sorted({round(width_of(result)) for result in results})
-        axis.set_xticks(ticks, [str(tick) for tick in ticks])
+        ticks = sorted(map(width_of, results))
+        axis.set_xticks(ticks, [f"{tick:.2g}" for tick in ticks])
         axis.minorticks_off()
     letter(axes.flat)
     axes.flat[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -82,9 +82,6 @@ def drawn(results: Sequence[Mapping[str, Any]]) -> Figure:
 if __name__ == "__main__":
     *sources, target = map(Path, sys.argv[1:])
     given = [json.loads(source.read_text()) for source in sources]
-    for result in given:
-        for row in result["rows"]:
-            row["name"] = {"learned": "resolved"}.get(row["name"], row["name"])  # its name in version 1.0
     for each in DRAWN:
         print(each, *(f"d/eta {at:.1f}: {name} {error:.3g}" for at, error, _, name in points(given, "grid", each)))
     target.write_bytes(png(drawn(given)))
