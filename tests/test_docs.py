@@ -13,11 +13,10 @@ import pytest
 
 from eddies.cli import main
 from eddies.cli_options import build_parser
-from eddies.scene.sections import METHODS
 from eddies.scene.model import Model, settings_class
 from eddies.scene.rules import quoted
-from eddies.scene.scene import BOX_LENGTH, Scene, SceneError, builtin_scenes, load_scene
-from eddies.scene.sections import Simulation
+from eddies.scene.scene import BOX_LENGTH, Scene, SceneError, Tracers, builtin_scenes, load_scene
+from eddies.scene.sections import METHODS, OF_A_SET, Simulation
 from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS
 
 CHECKOUT = Path(__file__).parents[1]
@@ -209,6 +208,9 @@ def scene_reference():
                 lines += [key_row(key) for key in dataclasses.fields(of_it)]
             if kind is Model:
                 lines += term_rows()
+            if kind is Tracers:
+                lines.append("| **`[tracers.NAME]`**, optional | | | *A set of tracers; keys: "
+                             f"{', '.join(OF_A_SET)}.* |")
     return "\n".join(lines)
 
 

@@ -89,7 +89,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
             look_at_work(step, comm, overwrite)  # a command that is refused must not end another job
     else:
         refuse_if_held(comm, directory)
-    made = {step.directory / STAGES[stage].file for step in planned for stage in step.stages}
+    made = {file for step in planned for file in step.files}
     for step in planned:
         check_inputs(step, comm, made)
     if on_first_rank(comm, lambda: os.path.exists(directory / "STOP")):  # ends a chain of jobs that queues itself again

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -26,29 +27,51 @@ class FieldLayout:
 
 
 @dataclass(frozen=True)
+class TrajectoryLayout:
+    """The content of the frames of particles."""
+
+    total: int  # number of particles
+    columns: Mapping[str, tuple[int, ...]]  # shape of a particle's value
+
+
+@dataclass(frozen=True)
 class FrameLayout:
     """The content of frames, in a segment and in the product. Series may have different times."""
 
-    total: int  # number of particles
     length: float  # edge of the periodic cube
-    trajectories: Mapping[str, Mapping[str, tuple[int, ...]]]  # by name: shape of a particle's value by column
+    trajectories: Mapping[str, TrajectoryLayout]  # by name
     dtype: type[np.floating]  # of the trajectories
     fields: Mapping[str, FieldLayout]  # by name
 
-    def writers(self, file: File, images: bool = False) -> tuple[dict[str, TrajectoryWriter], dict[str, FieldWriter]]:
-        """Writers of the trajectories and of the fields, by name; collective. `images` adds the column of images to
-        trajectories with positions."""
-        return ({name: TrajectoryWriter(file, name, self.total, self.length, columns, self.dtype,
-                                        images and "position" in columns)
-                 for name, columns in self.trajectories.items()},
-                {name: FieldWriter(file, name, series.cells, series.variables) for name, series in self.fields.items()})
+    def writers(self, file: File, names: Mapping[str, str] | None = None
+                ) -> tuple[dict[str, TrajectoryWriter], dict[str, FieldWriter]]:
+        """Writers of the trajectories and of the fields, by name; collective.
+
+        A product has the series of `names`, under the names there, and trajectories with positions have images. Without
+        `names` it is a segment with all series.
+        """
+        def stored(series: Mapping[str, Any]) -> Iterator[tuple[str, str, Any]]:
+            for name, layout in series.items():
+                if names is None or name in names:
+                    yield name, name if names is None else names[name], layout
+
+        return ({name: TrajectoryWriter(file, group, layout.total, self.length, layout.columns, self.dtype,
+                                        names is not None and "position" in layout.columns)
+                 for name, group, layout in stored(self.trajectories)},
+                {name: FieldWriter(file, group, layout.cells, layout.variables)
+                 for name, group, layout in stored(self.fields)})
+
+    @property
+    def names(self) -> dict[str, str]:
+        """All series, each under its own name."""
+        return {name: name for name in (*self.trajectories, *self.fields)}
 
 
 class FrameSegments:
     """The files frames-NNNNNNNN.h5 of a directory, named after their first step; `names` lists the closed ones. The
     first may be a product with the same series.
 
-    If the context ends with an exception, the open segment is removed. `assemble` copies all frames into the product.
+    If the context ends with an exception, the open segment is removed. `assemble` copies frames into a product.
     """
 
     def __init__(self, comm: MPI.Comm, directory: Path, layout: FrameLayout, names: Sequence[str] = ()) -> None:
@@ -80,19 +103,20 @@ class FrameSegments:
                 frames += [(time, self._values(stored, frame)) for frame, time in enumerate(stored.times[:count])]
         return frames[:count]
 
-    def assemble(self, file: File) -> None:
-        """Copy the frames of all segments into a product, which also counts the images."""
+    def assemble(self, file: File, names: Mapping[str, str] | None = None) -> None:
+        """Copy the frames of all segments into a product, which also counts the images: of all series, or of those of
+        `names` under the names there."""
         self.close()
-        trajectories, fields = self.layout.writers(file, images=True)
+        trajectories, fields = self.layout.writers(file, self.layout.names if names is None else names)
         slabs = {name: SlabDecomposition(self.comm, self.layout.length, series.cells)
                  for name, series in self.layout.fields.items()}
-        start, _ = id_block(self.comm, self.layout.total)
+        starts = {name: id_block(self.comm, series.total)[0] for name, series in self.layout.trajectories.items()}
         for name in self.names:
             with open_product(self.comm, self.directory / name, None) as segment:
                 for group, trajectory in trajectories.items():
                     frames = Trajectory(segment, group)
                     for frame, (step, time) in enumerate(zip(frames.steps, frames.times)):
-                        trajectory.append(step, time, start, self._values(frames, frame))
+                        trajectory.append(step, time, starts[group], self._values(frames, frame))
                 for group, field in fields.items():
                     series, slab = FieldSeries(segment, group), slabs[group]
                     for index, time in enumerate(series.times):
@@ -107,5 +131,5 @@ class FrameSegments:
 
     def _values(self, frames: Trajectory, frame: int) -> dict[str, np.ndarray]:
         """This rank's block of all columns of a frame."""
-        block = id_block(self.comm, self.layout.total)
+        block = id_block(self.comm, frames.total)
         return {column: frames.read(frame, column, *block) for column in frames.columns}

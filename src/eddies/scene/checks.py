@@ -130,10 +130,19 @@ def check_tracers(tracers: Tracers, flow: Flow, initial: Initial) -> Problems:
     if initial.flow.sound:
         yield "initial.kind", ("starts from rest and has no turnover time, in which [tracers] turnovers are counted; "
                                "choose another kind, or remove [tracers]")
-    if tracers.cells > flow.cells:
-        default = "" if tracers.field_cells else f"is {tracers.cells} (from particles_per_side) and "
-        yield "tracers.field_cells", (f"{default}must be at most [flow] cells = {flow.cells}; lower field_cells "
-                                      "or raise cells")
+    for each in tracers.all:
+        if each.cells > flow.cells:
+            default = "" if each.field_cells else f"is {each.cells} (from particles_per_side) and "
+            yield "tracers.field_cells", (f"{default}must be at most [flow] cells = {flow.cells}; lower field_cells "
+                                          "or raise cells")
+
+
+def check_sets(tracers: Tracers, variants: Collection[str]) -> Problems:
+    """Names of sets of tracers that are no names of directories, or those of variants."""
+    for name in tracers.sets:
+        problem = problem_of_name(name) or name in variants and "a variant has this name; choose another"
+        if problem:
+            yield "tracers", f"set {name}: {problem}"
 
 
 def check_reach(section: str, neighbors: float, tracers: Tracers, skin: float) -> Problems:

@@ -81,11 +81,22 @@ class Scene(Section):
         """The scene without kernel, model and rollout."""
         return replace(self.without_variants, kernel=None, model=None, training=None, simulation=None, eulerian=None)
 
+    @property
+    def tracer_sets(self) -> "dict[str, Scene]":
+        """The scenes of the sets of tracers by name, without variants; each has chosen its set."""
+        whole = self.without_variants
+        return {name: replace(whole, tracers=own) for name, own in (self.tracers.sets if self.tracers else {}).items()}
+
     # ---- values that follow from several sections
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """The stages that this scene asks for, in the order in which they run."""
+        """The stages that this scene asks for, in the order in which they run.
+
+        Tracers of several sets only have ground truths: a scene must choose a set for the other stages.
+        """
+        if self.tracers is not None and self.tracers.sets:
+            return "dns", "report"
         learned = self.simulation is None or self.needs_model
         finds = self.simulation is not None and self.simulation.finds_step
         return tuple(stage.name for stage in STAGES.values()
@@ -198,6 +209,9 @@ class Scene(Section):
         """Raise SceneError if the section of a stage is missing."""
         for stage in stages:
             if stage not in self.stages:
+                if self.tracers is not None and self.tracers.sets:
+                    raise SceneError(f"{self.name}: `eddies {stage}` needs one set of tracers; set [tracers] set to "
+                                     f"one of {', '.join(self.tracers.sets)}")
                 if stage == "train" and self.model is not None and self.simulation is not None:
                     raise SceneError(f'{self.name}: [simulation] method = "{self.simulation.method}" needs no trained '
                                      'model; set method = "learned" to train one')
@@ -224,6 +238,7 @@ class Scene(Section):
         yield from checks.check_time(self.time, flow, self.forcing, self.spin_up, tracers)
         if tracers is not None:
             yield from checks.check_tracers(tracers, flow, self.initial)
+            yield from checks.check_sets(tracers, self.variant)
             for name, neighbors in (("kernel", kernel and kernel.neighbors), ("model", model and model.neighbors)):
                 yield from checks.check_reach(name, neighbors or 0.0, tracers, simulation.skin if simulation else 0.0)
         yield from checks.check_needs(present, self.needs_model, model is not None and model.path is not None)
@@ -243,6 +258,9 @@ class Scene(Section):
             yield problem
         elif not isinstance(variant, Scene) or variant.variant or variant.realisations:
             yield "must be a scene without variants and realisations of its own"
+        elif variant.tracers is not None and variant.tracers.sets:
+            yield (f"needs one set of tracers; set {VARIANT}.{name}.tracers.set, or [tracers] set for all, to one of "
+                   f"{', '.join(variant.tracers.sets)}")
         elif variant.simulation is None or self.simulation is None:
             yield "variants are compared by their rollouts; add [simulation] to the scene and to its variants"
         else:

@@ -39,7 +39,7 @@ def _object(kind: type[Section]) -> dict[str, Any]:
     if kind is Model:
         properties |= {word: _object(settings) for word, settings in TERMS.items()}
     return {"type": "object", "description": str(kind.__doc__).splitlines()[0], "properties": properties,
-            "additionalProperties": {"type": "object"} if kind is Model else False}
+            "additionalProperties": {"type": "object"} if kind._holder else False}
 
 
 def _value(rule: Rule, default: Any) -> dict[str, Any]:

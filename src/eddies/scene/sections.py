@@ -4,16 +4,21 @@ Lengths are in units of the cube [0, 2 pi)^3, the mean density is 1, and the uni
 velocities.
 """
 
+from __future__ import annotations
+
+import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar
 
 from eddies.import_path import is_path, load
 from eddies.pipeline import STAGES
 from eddies.scene.integrators import SCHEMES, Scheme
 from eddies.scene.rules import quoted
-from eddies.scene.values import (SceneError, Section, boolean, choice, expanded, integer, integers, named, number,
-                                 product_file, section, text, texts)
+from eddies.scene.values import (KeyProblem, SceneError, Section, boolean, choice, expanded, integer, integers, named,
+                                 number, product_file, section, sections, text, texts)
 
 BOX_LENGTH = 2 * math.pi
 DEFAULT_WINDOW = 0.5
@@ -142,15 +147,29 @@ class SpinUp(Section):
                                       default=None, above=0)
 
 
+# The keys in which sets of tracers may differ.
+OF_A_SET = ("particles_per_side", "placement", "seed", "filtered", "filter_width", "field_cells")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Tracers(Section):
     """Particles that follow the filtered flow: the ground truth of learning.
 
-    An absent `filter_width` gets its value when the section is made.
+    An absent `filter_width` gets its value when the section is made. `sets` has several sets that one simulation
+    carries, by NAME of [tracers.NAME]; each has the values of its own keys and else those of [tracers]. A scene that
+    chooses one by `set` has the values of that set, and no sets.
     """
 
+    _holder: ClassVar[str] = "sets"
+
+    set: str | None = text("NAME of the set [tracers.NAME] to use; absent: with such sets only ground truths are made, "
+                           "one for each", default=None)
     particles_per_side: int = integer("cube root of the number of particles", at_least=2, at_most=MOST_CELLS)
     placement: str = choice("initial positions of the particles", "random", "lattice", default="random")
+    seed: int = integer("number that is added to the seed of the scene for the initial positions", default=0,
+                        at_least=0, at_most=10**18)
+    filtered: bool = boolean("whether the particles follow the filtered velocity; false: that of the whole flow",
+                             default=True)
     filter_width: float = number("width of the Gaussian filter, whose tails meet beyond half the cube; absent: twice "
                                  "the mean spacing, or half the cube where that is less",
                                  default=None, above=0, at_most=BOX_LENGTH / 2)
@@ -161,11 +180,39 @@ class Tracers(Section):
     field_cells: int | None = integer("cells along each side of the stored fields; absent: 1.5 x particles_per_side, "
                                       "even", default=None, at_least=4)
     field_every: int = integer("number of frames per stored field", default=5, at_least=1)
+    sets: Mapping[str, Tracers] = sections()
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        sets = {name: self._set_of(name, own) for name, own in self.sets.items()}
+        if self.set is not None and self.set not in sets:
+            raise self.problem("set", f"there is no section [tracers.{self.set}]; there are: "
+                               f"{', '.join(sets) or 'none'}")
         if self.filter_width is None:
             object.__setattr__(self, "filter_width", min(2 * self.spacing, BOX_LENGTH / 2))
+        object.__setattr__(self, "sets", sets)
+        if self.set is not None:
+            chosen = sets[self.set]
+            for field in dataclasses.fields(self):
+                object.__setattr__(self, field.name, getattr(chosen, field.name))
+
+    def _set_of(self, name: str, own: Any) -> Tracers:
+        """A set from its table, or from an object whose other keys are those of this section."""
+        if isinstance(own, Tracers):
+            return dataclasses.replace(self, sets={}, set=None, **{key: getattr(own, key) for key in OF_A_SET})
+        for key in own:
+            if key not in OF_A_SET:
+                raise KeyProblem(f"tracers.{name}", key, ": no key of a set; the sets share all keys of [tracers] but "
+                                 f"{', '.join(OF_A_SET)}")
+        try:
+            return dataclasses.replace(self, sets={}, set=None, **own)
+        except KeyProblem as problem:
+            raise problem.within(f"tracers.{name}") from None
+
+    @property
+    def all(self) -> tuple[Tracers, ...]:
+        """The sets that the simulation carries; the section itself if it has none."""
+        return tuple(self.sets.values()) or (self,)
 
     @property
     def particles(self) -> int:

@@ -203,7 +203,8 @@ def _missing_key(kind: type[Section], field: dataclasses.Field, section: str) ->
 def write_section(section: Section, name: str = "", all_keys: bool = False) -> list[str]:
     """Return the lines `key = value  # meaning` of a section and of its own sections.
 
-    Absent keys and sections, and sections without keys, are left out. With `all_keys` comments list them.
+    Absent keys and sections, and sections without keys, are left out. With `all_keys` comments list them. A section
+    within one of its own class does not repeat its lines.
     """
     lines, inner = [], []
     for field in dataclasses.fields(section):
@@ -219,7 +220,8 @@ def write_section(section: Section, name: str = "", all_keys: bool = False) -> l
             inner += [f"# {line.removeprefix('# ')}" for line in _declared_lines(kind)]
         elif field.name == section._holder:
             for key, part in value.items():
-                if written := write_section(part, all_keys=all_keys):
+                written = [line for line in write_section(part, all_keys=all_keys) if line not in lines]
+                if written or isinstance(part, type(section)):
                     inner += ["", f"[{name}.{key}]", *written]
     return lines + inner
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
@@ -16,7 +16,9 @@ from eddies.flow.history import FlowHistory
 from eddies.io.checkpoint import Guard
 from eddies.io.fields import FieldWriter
 from eddies.io.frame_segments import FrameSegments
-from eddies.io.hdf5 import File, ProductError, create_product, open_product, write_attributes, write_table
+from eddies.io.hdf5 import (File, ProductError, create_product, in_files, open_product, write_attributes,
+                            write_table)
+from eddies.io.new_files import write_files
 from eddies.io.provenance import product_provenance
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_first_rank
@@ -24,9 +26,9 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene, SceneError
-from eddies.scene.sections import SpinUp
+from eddies.scene.sections import Forcing, SpinUp
 from eddies.time_stepping import STEPPERS
-from eddies.workflows.ground_truth.flow_run import FlowRun, TracerRun, frame_layout
+from eddies.workflows.ground_truth.flow_run import FlowRun, TracerRun, frame_layout, series_of
 from eddies.workflows.ground_truth.frame_counts import whole_frames
 from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
 from eddies.workflows.problems import check_span
@@ -40,6 +42,9 @@ SpanCheck = Callable[[float, float], None]
 
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Simulate the flow of a scene and write ground_truth.h5: statistics, and frames and fields with [tracers].
+
+    With sets of tracers each set has a ground truth of its own, SET/ground_truth.h5, as if it were the only one. That
+    of the run directory is then one without tracers.
 
     The flow is first spun up ([spin_up]). The forcing ends at the release of the tracers, unless [tracers] forced. The
     run continues from the newest checkpoint in the directory that has the same settings, except for how long it goes
@@ -80,7 +85,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 saved = None
                 span = scene.tracers.turnovers * flow.history.sample(flow.state, flow.clock)["eddy_turnover_time"]
                 check_span(scene.time, span, flow.step_limit.bound(flow.state, flow.clock), scene.tracers)
-            layout = frame_layout(scene.tracers, fluid.compressible, fluid.grid.cutoff)
+            layout, sets = frame_layout(scene.tracers, fluid.compressible, fluid.grid.cutoff), scene.tracer_sets
             before = () if saved is None else saved.files or [f"../{product.name}"]
             with FrameSegments(comm, guard.checkpoints.path, layout, before) as parts:
                 whole = partial(whole_frames, scene.simulation, scene.training, scene.tracers.field_every)
@@ -89,12 +94,19 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                     raise too_late(guard, f"[tracers] turnovers = {scene.tracers.turnovers:g}")
                 tracers.follow()
                 final = flow.state_dict()
-                flow.history.sample(flow.state, flow.clock)
-                parts.assemble(file)
-            scales = scales_of(tracers.released) | tracers.scales()
-            if fluid.forcing is not None:
-                write_attributes(file.create_group("forcing"), asdict(scene.forcing))
-            tracers.write_spectra(file)
+                last = flow.history.sample(flow.state, flow.clock)
+                for name, own in sets.items():
+                    path = directory / name / product.name
+                    in_files(comm, path, partial(prepare_set, path.parent, own.to_toml()))
+                    with create_product(comm, path, "ground_truth", stage_provenance(own, "dns")) as part:
+                        write_tracers(part, tracers, name, parts, own.forcing)
+                        write_flow(part, flow, scales_of(tracers.released) | tracers.scales(name), own.spin_up)
+                if not sets:
+                    write_tracers(file, tracers, "", parts, scene.forcing)
+                    scales = scales_of(tracers.released) | tracers.scales("")
+            if sets:
+                write_final_fields(file, flow)
+                scales = scales_of(last)
         else:
             if flow.phase == "run" and flow.clock.time > flow.began + scene.time.duration * (1 + 1e-9):
                 raise too_late(guard, f"[time] duration = {scene.time.duration:g}")
@@ -102,15 +114,35 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             final = flow.state_dict()
             write_final_fields(file, flow)
             scales = scales_of(flow.history.sample(flow.state, flow.clock))
-        write_attributes(file.create_group("reference"), {
-            **scales, "viscosity": fluid.viscosity, "energy_budget_error": flow.history.budget_error})
-        write_table(file, "statistics", flow.history.columns())
-        energy = np.array(flow.history.spectra)
-        write_table(file, "spectra_of_statistics", {"wavenumber": np.arange(energy.shape[1]), "energy": energy})
-        if scene.spin_up is not None and scene.spin_up.stationary is not None:
-            write_attributes(file.create_group("stationary"), stationary_span(scene.spin_up, flow.history))
+        write_flow(file, flow, scales, scene.spin_up)
     guard.checkpoints.remove()
-    guard.checkpoints.write(flow.steps, final)
+    if not scene.tracer_sets:
+        guard.checkpoints.write(flow.steps, final)
+
+
+def prepare_set(directory: Path, scene: str) -> None:
+    """Make the run directory of a set of tracers, with the text of its scene."""
+    directory.mkdir(exist_ok=True)
+    write_files({directory / "scene.toml": scene})
+
+
+def write_tracers(file: File, tracers: TracerRun, name: str, parts: FrameSegments, forcing: Forcing | None) -> None:
+    """Write the frames, fields and spectra of a set of tracers, and the forcing that acts on them; collective."""
+    parts.assemble(file, series_of(name))
+    if tracers.flow.fluid.forcing is not None:
+        write_attributes(file.create_group("forcing"), asdict(forcing))
+    tracers.sets[name].write_spectra(file)
+
+
+def write_flow(file: File, flow: FlowRun, scales: Mapping[str, float], spin_up: SpinUp | None) -> None:
+    """Write the scales and the statistics of a flow; collective."""
+    write_attributes(file.create_group("reference"), {
+        **scales, "viscosity": flow.fluid.viscosity, "energy_budget_error": flow.history.budget_error})
+    write_table(file, "statistics", flow.history.columns())
+    energy = np.array(flow.history.spectra)
+    write_table(file, "spectra_of_statistics", {"wavenumber": np.arange(energy.shape[1]), "energy": energy})
+    if spin_up is not None and spin_up.stationary is not None:
+        write_attributes(file.create_group("stationary"), stationary_span(spin_up, flow.history))
 
 
 def holds_frames(comm: Comm, product: Path, count: int) -> bool:

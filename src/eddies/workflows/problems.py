@@ -81,7 +81,7 @@ def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
     """
     comm, planned = context.comm, steps(scene, context.stages, context.directory, context.variants)
     on_node = node_ranks(comm)
-    made = {step.directory / STAGES[stage].file for step in planned for stage in step.stages}
+    made = {file for step in planned for file in step.files}
     refused: dict[str, None] = {}
     doubts: dict[str, list[str]] = {}
     for step in planned:
@@ -97,6 +97,9 @@ def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
     if "report" in context.stages:
         refused |= dict.fromkeys(place_problems(("report",), comm, context.directory))
     needed = most_disk(disk(step.scene, stage) for step in planned for stage in step.stages)
+    if scene.tracers is not None and scene.tracers.sets and scene.kernel is not None and not scene.variant:
+        doubts[f"[tracers] set: is absent, so that only the ground truths of {', '.join(scene.tracers.sets)} are made; "
+               "choose one of them for kernel, model and rollout"] = []
     if needed > context.free_disk:
         doubts[f"the stages need about {in_units(needed)} of disk, and {in_units(context.free_disk)} are free here; "
                "choose another --output, or raise [tracers] frame_interval or field_every"] = []
@@ -251,8 +254,8 @@ def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
             yield from laminar_flow(scene.flow, expected.turbulence)
         yield from compressibility(scene.flow, expected.rms_speed)
         yield from stability(scene.flow, scene.time, expected)
-        if tracers is not None:
-            yield from filter_width(tracers, scene.flow, scene.initial, scene.forcing)
+        for each in tracers.all if tracers is not None else ():
+            yield from filter_width(each, scene.flow, scene.initial, scene.forcing)
     if "train" in stages and training is not None:
         yield from untrained_terms(model, training)
     if "simulate" in stages:

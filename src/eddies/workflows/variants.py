@@ -3,6 +3,7 @@
 A scene without variants and realisations has one step, in the run directory. Otherwise the run directory holds
 
     ground_truth.h5, kernel.h5            of the scene, made once
+    SET/ground_truth.h5                   of a set of tracers, made together with the first
     realisation-SEED/                     the same for further ground truths, which no training sees
     VARIANT/                              model and rollout of a variant
     VARIANT/realisation-SEED/             its rollouts, one for each realisation
@@ -21,7 +22,7 @@ from pathlib import Path
 from eddies.io.provenance import product_fingerprint
 from eddies.pipeline import STAGES
 from eddies.scene.scene import REALISATION, Scene
-from eddies.workflows.run_directory.fingerprints import stage_fingerprint
+from eddies.workflows.run_directory.fingerprints import set_files, stage_fingerprint
 
 # Stages whose products variants share if their settings agree.
 SHARED = ("dns", "train-kernel")
@@ -47,6 +48,12 @@ class Step:
     directory: Path
     variant: str | None = None
     links: Mapping[str, Path] = field(default_factory=dict)
+
+    @property
+    def files(self) -> list[Path]:
+        """The files of the products that its stages make."""
+        found = [self.directory / STAGES[stage].file for stage in self.stages]
+        return found + [self.directory / each for each in set_files(self.scene)] * ("dns" in self.stages)
 
     def holder(self, stage: str) -> Path:
         """The directory of the product of a stage, whether or not the product exists yet."""
@@ -103,6 +110,8 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
         making = tuple(stage for stage in stages if stage in MAKING)
         return [Step(scene, making, directory)] if making else []
     whole, seeds = scene.without_variants, scene.realisations or ()
+    # The ground truths that a variant may use, each by its directory below that of the scene or of a realisation.
+    truths = {mark: path.parent for path, mark in set_files(whole).items()} or {stage_fingerprint(whole, "dns"): Path()}
     realisations = tuple(directory / f"{REALISATION}{seed}" for seed in seeds)
     planned = [(None, Place(whole, directory), SHARED)]
     for seed, place in zip(seeds, realisations):
@@ -114,9 +123,10 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
     for name in chosen:
         own = scene.variant[name] if name else whole
         if seeds and own.simulation.finds_step and own.simulation.confirmed_on is None and (
-                stage_fingerprint(own, "dns") == stage_fingerprint(whole, "dns")):
+                (below := truths.get(stage_fingerprint(own, "dns"))) is not None):
             # A step must converge on all realisations, unless these are of another flow than the variant's.
-            own = replace(own, simulation=replace(own.simulation, confirmed_on=tuple(map(str, realisations))))
+            confirmed_on = tuple(str(place / below) for place in realisations)
+            own = replace(own, simulation=replace(own.simulation, confirmed_on=confirmed_on))
         trained = ("train",) if not seeds or own.model is not None and own.model.path is None else ()
         planned.append((name, Place(own, directory / (name or "")), (*SHARED, *trained, "find-step")))
     places = rollouts(scene, directory)
@@ -138,6 +148,8 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
                     working.append(stage)  # finds the link; rollouts on realisations take their weights from here
             elif stage in possible and holder is None:
                 made[key] = where
+                if stage == "dns":
+                    made |= {(stage, mark): (where / path).parent for path, mark in set_files(own).items()}
                 working += [stage] if stage in stages else []
         if working:
             found.append(Step(own, tuple(working), where, name, links))

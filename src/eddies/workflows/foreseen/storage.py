@@ -57,7 +57,8 @@ def flow_memory(flow: Flow, tracers: Tracers | None, ranks: int) -> float:
     block = BLOCK_ARRAYS[flow.compressible] * max(threads() * BLOCK_BYTES, 2 * cells**2 * real)
     points = cells**2 * math.ceil(cells / ranks)
     size = FLOW_PROCESS + CELL_BYTES[flow.compressible] * real / 8 * points + block
-    return size + (3 * real * points + TRACER_BYTES * tracers.particles / ranks if tracers else 0.0)
+    sets = tracers.all if tracers else ()
+    return size + sum(3 * real * points + TRACER_BYTES * each.particles / ranks for each in sets)
 
 
 class Disk(NamedTuple):
@@ -106,9 +107,12 @@ def most_disk(work: Iterable[Disk]) -> float:
 def trajectory_bytes(flow: Flow, tracers: Tracers, frames: int, whole: int) -> int:
     """Size of frames of tracers (position, velocity, images of the box and density), of filtered fields, and of a
     number of `whole` states."""
-    points = (tracers.cells**3 * math.ceil(frames / tracers.field_every)
-              + whole_cells(flow.largest_wavenumber) ** 3 * whole)
-    return frames * tracers.particles * (2 * 24 + 6 + 8 * flow.compressible) + 4 * flow.components * points
+    size = 0
+    for each in tracers.all:
+        points = (each.cells**3 * math.ceil(frames / each.field_every)
+                  + whole_cells(flow.largest_wavenumber) ** 3 * whole)
+        size += frames * each.particles * (2 * 24 + 6 + 8 * flow.compressible) + 4 * flow.components * points
+    return size
 
 
 def rollout_bytes(particles: int, frames: int) -> int:

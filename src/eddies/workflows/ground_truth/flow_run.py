@@ -17,7 +17,7 @@ from eddies.flow.stability import StabilityWatch
 from eddies.flow.statistics import energy_spectrum
 from eddies.flow.tracers import FilteredField, TracerParticles, release
 from eddies.io.checkpoint import Block, Checkpoint, Guard
-from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments
+from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments, TrajectoryLayout
 from eddies.io.hdf5 import File, write_table
 from eddies.parallel.migration import IdOrder, id_block, migrate
 from eddies.parallel.slab import SlabDecomposition
@@ -91,11 +91,80 @@ class FlowRun:
         self.history.load_state_dict(saved)
 
 
+class TracerSet:
+    """The particles of one set, and its filtered fields and spectra.
+
+    Parameters
+    ----------
+    fluid, state : the flow.
+    settings, seed : the set, and the seed of random places.
+    saved : the checkpoint, or None for a release.
+    suffix : ends the names of the set's series in segments and of its arrays in checkpoints; empty for the only set.
+    """
+
+    def __init__(self, fluid: Fluid, state: np.ndarray, settings: Tracers, seed: int, saved: Checkpoint | None,
+                 suffix: str) -> None:
+        self.fluid, self.settings, self.suffix = fluid, settings, suffix
+        slab, filters = fluid.grid.decomposition, FilteredField(fluid.grid, settings.filter_width,
+                                                                settings.interpolation)
+        self.comm, self.filtered = slab.comm, filters
+        if saved is None:
+            columns = release(slab, seed + settings.seed, settings.particles_per_side, settings.placement)
+        else:
+            start, stop = id_block(self.comm, settings.particles)
+            block = {name: saved.read(name + suffix, start, stop) for name in ("position", "velocity")}
+            columns = migrate(slab, {"id": np.arange(start, stop, dtype=np.int64), **block})
+        followed = filters if settings.filtered else FilteredField(fluid.grid, 0.0, settings.interpolation)
+        self.tracers, self.coarse = TracerParticles(followed, columns, state), grid_of(fluid.grid, settings.cells)
+        names = "time", "energy", "filtered"
+        self.spectra = {name: [] if saved is None else list(saved[f"spectra_{name}{suffix}"]) for name in names}
+
+    def store(self, segments: FrameSegments, state: np.ndarray, step: int, time: float, with_fields: bool) -> None:
+        """Store the particles at a time since the release and, `with_fields`, filtered fields and spectra."""
+        columns, compressible = self.tracers.columns, self.fluid.compressible
+        order = IdOrder(self.comm, columns["id"], self.settings.particles)
+        frame = {name: order.apply(columns[name]) for name in ("position", "velocity")}
+        if compressible:
+            frame["density"] = order.apply(self.tracers.density(state))
+        segments.trajectories[f"tracers{self.suffix}"].append(step, time, order.start, frame)
+        if not with_fields:
+            return
+        field, grid = self.filtered, self.coarse
+        velocity = field.transfer * state[:3]
+        modes = {"velocity": velocity} | ({"density": field.density_modes(state)} if compressible else {})
+        planes = {name: grid.backward(regrid(field.grid, grid, part)) for name, part in modes.items()}
+        segments.fields[f"filtered{self.suffix}"].append(time, grid.decomposition.start, planes)
+        for name, value in (("time", time), ("energy", energy_spectrum(field.grid, state[:3])[1]),
+                            ("filtered", energy_spectrum(field.grid, velocity)[1])):
+            self.spectra[name].append(value)
+
+    def scales(self, segments: FrameSegments) -> dict[str, float]:
+        """Scales of the particles at the release. Rates are differences between the first two frames, so that the
+        scales do not depend on the rest of the run."""
+        (start, first), (end, second) = segments.first_frames(f"tracers{self.suffix}", 2)
+        return {"filter_width": self.settings.filter_width, "spacing": self.settings.spacing,
+                "density_mean": MEAN_DENSITY, **measured_scales(self.comm, first, second, end - start)}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The state for a checkpoint, besides the frames."""
+        order = IdOrder(self.comm, self.tracers.columns["id"], self.settings.particles)
+        columns = {name: Block(order.apply(self.tracers.columns[name]), order.start, self.settings.particles)
+                   for name in ("position", "velocity")}
+        spectra = {f"spectra_{name}": np.array(rows) for name, rows in self.spectra.items()}
+        return {name + self.suffix: value for name, value in (columns | spectra).items()}
+
+    def write_spectra(self, file: File) -> None:
+        """Write the table of unfiltered and filtered energy spectra."""
+        wavenumber = np.arange(len(self.spectra["energy"][0]))
+        columns = {name: np.array(rows) for name, rows in self.spectra.items()}
+        write_table(file, "spectra", {"wavenumber": wavenumber, **columns})
+
+
 class TracerRun:
     """Releases tracers into a flow, or takes them from a checkpoint, and follows them to the end.
 
     Within a frame interval all steps are equal: the longest allowed steps that divide it, so that frames are equally
-    spaced. `released` is the sample of the flow at the release.
+    spaced. `released` is the sample of the flow at the release, `sets` are the sets by name, "" for an only one.
 
     Parameters
     ----------
@@ -112,24 +181,15 @@ class TracerRun:
         flow.phase, flow.tracers = "tracers", self
         if not settings.forced:
             flow.fluid.forcing = None
-        field = FilteredField(flow.fluid.grid, settings.filter_width, settings.interpolation)
-        slab = flow.fluid.grid.decomposition
-        self.comm = slab.comm
         if saved is None:
             self.released, self.released_at = flow.history.sample(flow.state, flow.clock), flow.clock.time
             self.interval, self.step, self.first_step = 0, 0.0, flow.clock.steps
-            columns = release(slab, seed, settings.particles_per_side, settings.placement)
         else:
             self.released, self.released_at = saved["released"], saved["released_at"]
             self.interval, self.step, self.first_step = saved["interval"], saved["step"], saved["first_step"]
-            start, stop = id_block(self.comm, settings.particles)
-            block = {name: saved.read(name, start, stop) for name in ("position", "velocity")}
-            columns = migrate(slab, {"id": np.arange(start, stop, dtype=np.int64), **block})
-        self.tracers = TracerParticles(field, columns, flow.state)
-        self.coarse, self.whole = self._grid_of(settings.cells), whole(self.intervals + 1)
-        names = "time", "energy", "filtered"
-        self.spectra = {name: [] if saved is None else list(saved[f"spectra_{name}"]) for name in names}
-        self.stored = 0 if saved is None else saved["frames"]
+        self.sets = {name: TracerSet(flow.fluid, flow.state, own, seed, saved, suffix_of(name))
+                     for name, own in (settings.sets or {"": settings}).items()}
+        self.whole, self.stored = whole(self.intervals + 1), 0 if saved is None else saved["frames"]
         if saved is None:
             self._store()
 
@@ -151,28 +211,18 @@ class TracerRun:
             flow.clock.end = flow.clock.time + self.settings.frame_interval
             self._finish_interval(progress)
 
-    def scales(self) -> dict[str, float]:
-        """Scales of the filtered flow at the release. Rates are differences between the first two frames, so that the
-        scales do not depend on the rest of the run."""
-        (start, first), (end, second) = self.segments.first_frames("tracers", 2)
+    def scales(self, name: str) -> dict[str, float]:
+        """Scales of the flow and of the particles of a set at the release."""
         return {"released_at": self.released_at, "sound_speed": self.flow.fluid.sound_speed,
-                "filter_width": self.settings.filter_width, "spacing": self.settings.spacing,
-                "density_mean": MEAN_DENSITY, **measured_scales(self.comm, first, second, end - start)}
+                **self.sets[name].scales(self.segments)}
 
     def state_dict(self) -> dict[str, Any]:
         """The state for a checkpoint, besides the flow and the files of `segments`."""
-        order = IdOrder(self.comm, self.tracers.columns["id"], self.settings.particles)
-        columns = {name: Block(order.apply(self.tracers.columns[name]), order.start, self.settings.particles)
-                   for name in ("position", "velocity")}
-        return {"released": self.released, "released_at": self.released_at, "interval": self.interval,
-                "step": self.step, "first_step": self.first_step, "frames": self.stored,
-                **{f"spectra_{name}": np.array(rows) for name, rows in self.spectra.items()}, **columns}
-
-    def write_spectra(self, file: File) -> None:
-        """Write the table of unfiltered and filtered energy spectra."""
-        wavenumber = np.arange(len(self.spectra["energy"][0]))
-        columns = {name: np.array(rows) for name, rows in self.spectra.items()}
-        write_table(file, "spectra", {"wavenumber": wavenumber, **columns})
+        found = {"released": self.released, "released_at": self.released_at, "interval": self.interval,
+                 "step": self.step, "first_step": self.first_step, "frames": self.stored}
+        for each in self.sets.values():
+            found |= each.state_dict()
+        return found
 
     def _longest_step(self) -> float:
         interval = self.settings.frame_interval
@@ -185,7 +235,8 @@ class TracerRun:
 
     def _finish_interval(self, progress: ProgressLine) -> None:
         flow, step = self.flow, self.step
-        flow.advance([flow.history, lambda state, _: self.tracers.advance(state, step),
+        flow.advance([flow.history, *(lambda state, _, each=each: each.tracers.advance(state, step)
+                                      for each in self.sets.values()),
                       lambda *_: progress(self._done, flow.clock.steps - self.first_step)], FixedStep(step))
         began = time.perf_counter()
         with progress.storing():
@@ -194,45 +245,46 @@ class TracerRun:
 
     def _store(self) -> None:
         """Store a frame, with filtered fields and spectra every `field_every` frames. Times count from the release."""
-        state, clock, columns = self.flow.state, self.flow.clock, self.tracers.columns
-        compressible, time_since = self.flow.fluid.compressible, clock.time - self.released_at
-        order = IdOrder(self.comm, columns["id"], self.settings.particles)
-        frame = {name: order.apply(columns[name]) for name in ("position", "velocity")}
-        if compressible:
-            frame["density"] = order.apply(self.tracers.density(state))
-        self.segments.open(clock.steps)
-        self.segments.trajectories["tracers"].append(clock.steps, time_since, order.start, frame)
-        if self.stored % self.settings.field_every == 0:
-            field, grid = self.tracers.field, self.coarse
-            velocity = field.transfer * state[:3]
-            modes = {"velocity": velocity} | ({"density": field.density_modes(state)} if compressible else {})
-            planes = {name: grid.backward(regrid(field.grid, grid, part)) for name, part in modes.items()}
-            self.segments.fields["filtered"].append(time_since, grid.decomposition.start, planes)
-            for name, value in (("time", time_since), ("energy", energy_spectrum(field.grid, state[:3])[1]),
-                                ("filtered", energy_spectrum(field.grid, velocity)[1])):
-                self.spectra[name].append(value)
-            if self.stored in self.whole:
-                # Velocity and density on the smallest grid that holds all their modes.
-                grid = self._grid_of(whole_cells(field.grid.cutoff))
-                values = grid.backward(regrid(field.grid, grid, state))
-                planes = {"velocity": values[:3]} | ({"density": np.exp(values[3:])} if compressible else {})
-                self.segments.fields["unfiltered"].append(time_since, grid.decomposition.start, planes)
+        state, fluid, time_since = self.flow.state, self.flow.fluid, self.flow.clock.time - self.released_at
+        steps, with_fields = self.flow.clock.steps, self.stored % self.settings.field_every == 0
+        self.segments.open(steps)
+        for each in self.sets.values():
+            each.store(self.segments, state, steps, time_since, with_fields)
+        if with_fields and self.stored in self.whole:
+            # Velocity and density on the smallest grid that holds all their modes.
+            grid = grid_of(fluid.grid, whole_cells(fluid.grid.cutoff))
+            values = grid.backward(regrid(fluid.grid, grid, state))
+            planes = {"velocity": values[:3]} | ({"density": np.exp(values[3:])} if fluid.compressible else {})
+            self.segments.fields["unfiltered"].append(time_since, grid.decomposition.start, planes)
         self.stored += 1
 
-    def _grid_of(self, cells: int) -> SpectralGrid:
-        """A grid of so many cells, with all modes of the flow that it can hold."""
-        fine = self.flow.fluid.grid
-        slab = SlabDecomposition(self.comm, fine.decomposition.length, cells)
-        return SpectralGrid(slab, fine.precision, min(fine.cutoff, (cells - 1) // 2))
+
+def grid_of(fine: SpectralGrid, cells: int) -> SpectralGrid:
+    """A grid of so many cells, with all modes of a finer grid that it can hold."""
+    slab = SlabDecomposition(fine.decomposition.comm, fine.decomposition.length, cells)
+    return SpectralGrid(slab, fine.precision, min(fine.cutoff, (cells - 1) // 2))
+
+
+def suffix_of(name: str) -> str:
+    """The end of the names of a set's series and arrays; empty for the only set, ""."""
+    return name and f"-{name}"
 
 
 def frame_layout(settings: Tracers, compressible: bool, cutoff: int) -> FrameLayout:
-    """The datasets of the ground truth; `cutoff` is the largest wavenumber of the unfiltered flow."""
+    """The datasets of the frames of all sets; `cutoff` is the largest wavenumber of the unfiltered flow."""
     columns, variables = {"position": (3,), "velocity": (3,)}, {"velocity": 3}
     if compressible:
         columns, variables = columns | {"density": ()}, variables | {"density": 1}
-    return FrameLayout(settings.particles, BOX_LENGTH, {"tracers": columns}, np.float64, {
-        "filtered": FieldLayout(settings.cells, variables), "unfiltered": FieldLayout(whole_cells(cutoff), variables)})
+    sets = {suffix_of(name): each for name, each in (settings.sets or {"": settings}).items()}
+    return FrameLayout(
+        BOX_LENGTH, {f"tracers{end}": TrajectoryLayout(each.particles, columns) for end, each in sets.items()},
+        np.float64, {f"filtered{end}": FieldLayout(each.cells, variables) for end, each in sets.items()}
+        | {"unfiltered": FieldLayout(whole_cells(cutoff), variables)})
+
+
+def series_of(name: str) -> dict[str, str]:
+    """The series of a set among those of `frame_layout`, by the names that they have in its ground truth."""
+    return {f"{series}{suffix_of(name)}": series for series in ("tracers", "filtered")} | {"unfiltered": "unfiltered"}
 
 
 def saved_modes(grid: SpectralGrid, modes: np.ndarray) -> Block:

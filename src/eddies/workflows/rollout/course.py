@@ -12,7 +12,7 @@ import numpy as np
 
 from eddies.clock import WARM_UP_STEPS, Clock, ProgressLine
 from eddies.io.checkpoint import Checkpoint, Guard
-from eddies.io.frame_segments import FrameLayout, FrameSegments
+from eddies.io.frame_segments import FrameLayout, FrameSegments, TrajectoryLayout
 from eddies.parallel.migration import IdOrder, wrap
 from eddies.parallel.reduction import global_sum
 from eddies.particles.particle_set import as_numpy
@@ -24,7 +24,7 @@ log = logging.getLogger("eddies")
 def frame_layout(total: int, length: float, density: bool) -> FrameLayout:
     """The datasets of a rollout with `total` particles in a box of edge `length`."""
     columns = {"position": (3,), "velocity": (3,), "acceleration": (3,)} | ({"density": ()} if density else {})
-    return FrameLayout(total, length, {"model": columns}, np.float32, {})
+    return FrameLayout(length, {"model": TrajectoryLayout(total, columns)}, np.float32, {})
 
 
 class Course:
@@ -104,20 +104,20 @@ class Course:
 
     def _store(self, at: float) -> None:
         """Store the frame at a time, and keep the mean kinetic energy <v.v>/2 of its particles."""
-        layout = self.segments.layout
+        layout, own = self.segments.layout, self.segments.layout.trajectories["model"]
         # The first step uses the forces of the first frame. Later frames evaluate forces for storing only.
         with self.progress.storing() if self.times else nullcontext():
             particles, acceleration = self.method.frame(at)
         with self.progress.storing():
             columns = {**particles.to_numpy(), "acceleration": as_numpy(acceleration)}
             columns["position"] = wrap(columns["position"], layout.length)
-            order = IdOrder(self.comm, columns["id"], layout.total)
+            order = IdOrder(self.comm, columns["id"], own.total)
             self.segments.open(self.steps)
             self.segments.trajectories["model"].append(self.steps, at, order.start, {
-                name: order.apply(columns[name]) for name in layout.trajectories["model"]})
+                name: order.apply(columns[name]) for name in own.columns})
             self.times.append(at)
         energy = 0.5 * float(particles.velocity.double().square().sum())
-        self.energy = float(global_sum(self.comm, energy)) / layout.total
+        self.energy = float(global_sum(self.comm, energy)) / own.total
 
     def _describe(self) -> str:
         return f"t {self.clock.time:.3f}  energy {self.energy:.4f}{self.method.status()}"

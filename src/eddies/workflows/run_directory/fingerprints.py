@@ -48,6 +48,11 @@ def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> 
     return hashlib.sha256(json.dumps(read).encode()).hexdigest()
 
 
+def set_files(scene: Scene) -> dict[Path, str]:
+    """Return the ground truths of the sets of tracers, relative to the run directory, each with its fingerprint."""
+    return {Path(name) / STAGES["dns"].file: stage_fingerprint(own, "dns") for name, own in scene.tracer_sets.items()}
+
+
 def stage_provenance(scene: Scene, stage: str) -> dict[str, Any]:
     """Return what the product of a stage keeps of the scene: its text, the stage's fingerprint, the kinds of the
     products that it is made from and, if the scene names any, the origins of the user's classes."""

@@ -18,13 +18,13 @@ from eddies.io.checkpoint import checkpoints_in
 from eddies.io.checksums import open_to_read
 from eddies.io.errors import ProductError, unreadable
 from eddies.io.hdf5 import open_product, read_attributes, read_table
-from eddies.io.provenance import product_provenance
+from eddies.io.provenance import product_fingerprint, product_provenance
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Scene, Simulation
 from eddies.scene.sections import CONVERGED
-from eddies.workflows.run_directory.fingerprints import DURATIONS, stage_fingerprint
+from eddies.workflows.run_directory.fingerprints import DURATIONS, set_files, stage_fingerprint
 
 SECONDS = "stage_seconds.json"
 FAILURE = "failure.txt"  # the error of a failed variant
@@ -68,7 +68,9 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
         continued = stage_fingerprint(scene, stage.name, DURATIONS.get(stage.name, ()))
         of_others = checkpoints and continued not in [fingerprint for _, fingerprint in checkpoints]
         origin = product_provenance(product)
-        if origin.get("fingerprint") == settings:
+        sets = set_files(scene) if stage.name == "dns" else {}
+        if origin.get("fingerprint") == settings and all(
+                product_fingerprint(directory / path) == mark for path, mark in sets.items()):
             done.add(stage.name)
             # Other settings may still be continued, and so may a direct simulation, for longer.
             if not of_others and stage.name != "dns":
