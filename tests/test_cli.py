@@ -293,16 +293,26 @@ def test_mistake_met_by_all_ranks_while_writing(comm, tmp_path, capfd, monkeypat
 def launch(ranks, *command):
     """A running Python program on some ranks, as the job scripts start it."""
     line = [sys.executable, LAUNCHER, "-n", str(ranks), "--", sys.executable, *command]
-    return subprocess.Popen(list(map(str, line)), stdin=subprocess.DEVNULL, text=True,
+    # os.environ lacks what MPI has added to the environment of this process, with which mpirun would not start.
+    return subprocess.Popen(list(map(str, line)), stdin=subprocess.DEVNULL, text=True, env=dict(os.environ),
                             stderr=subprocess.STDOUT, stdout=subprocess.PIPE)
+
+
+def read_until(words, job):
+    """The output of a job up to the line with these words."""
+    output = ""
+    while words not in output:
+        line = job.stdout.readline()
+        assert line, f"the job ended: {output}"
+        output += line
+    return output
 
 
 # During set-up, and some steps later. The launcher passes on every signal as SIGUSR1.
 @pytest.mark.parametrize("number, after", [(signal.SIGTERM, 0), (signal.SIGHUP, 1)])
 def test_a_signal_ends_the_job_to_be_resumed(tmp_path, number, after):
     job, output = launch(2, "-m", "eddies", "dns", "hit-small", "--output", tmp_path), ""
-    while "dns: starts" not in output:
-        output += job.stdout.readline()
+    output += read_until("dns: starts", job)
     time.sleep(after)
     begin = time.monotonic()
     job.send_signal(number)
@@ -316,8 +326,7 @@ def test_a_second_job_is_refused_and_may_take_over(tmp_path):
     """Both jobs have two ranks. The first one prints only the reason for its end."""
     line = ("-m", "eddies", "dns", "hit-small", "--output", tmp_path / "run", "--max-minutes", "0.02")
     first, output = launch(2, *line[:-2]), ""
-    while "dns: starts" not in output:
-        output += first.stdout.readline()
+    output += read_until("dns: starts", first)
     begun = (tmp_path / "run/LOCK").read_bytes()
     second = launch(2, *line)
     assert "another job works here" in second.communicate(timeout=60)[0] and second.returncode == 2
