@@ -136,7 +136,7 @@ def test_particles_follow_the_coarse_flow(comm, folder, equations, closure):
         model = columns["model"]
         assert attributes["status"] == "complete"
         assert moved_by(attributes).endswith(
-            f"on 12³ cells, |kᵢ| ≤ 3, incompressible, {equations} velocity, closure: {closure}")
+            f"on 12³ cells, |kᵢ| ≤ 3, incompressible, {equations} velocity, closure: {closure}, started from the flow")
         # It resolves |k| <= 3 of a flow that has most of its energy there.
         assert 0 < velocity_error(columns, 0) < 0.2 and velocity_error(columns, -1) < 0.35
         # The acceleration is the rate of change of the velocity along the way: centred differences are of second order.
@@ -148,6 +148,27 @@ def test_particles_follow_the_coarse_flow(comm, folder, equations, closure):
         # Computed and stored in single precision.
         assert np.abs(alone["acceleration"] - model["acceleration"]).max() < 1e-4
         assert np.abs(alone["position"] - model["position"]).max() < 1e-5
+    comm.Barrier()
+
+
+@pytest.mark.mpi(2)
+@pytest.mark.parametrize("equations", ["unfiltered", "filtered"])
+def test_a_grid_starts_from_what_the_particles_tell(comm, folder, equations):
+    """Also at a time at which the whole flow is not stored, from which the true modes cannot be taken."""
+    form = ["simulation.method=eulerian", "eulerian.cells=16", "simulation.precision=float64", "simulation.start=0.3",
+            "simulation.turnovers=0.04", f"eulerian.equations={equations}"]
+    with pytest.raises(SceneError, match="holds the unfiltered flow at"):
+        simulate(comm, folder, *form)
+    simulate(comm, folder, *form, "eulerian.start=particles")
+    if comm.rank == 0:
+        attributes, _, columns = read(folder)
+        assert moved_by(attributes).endswith("started from the particles")
+        # What 512 particles determine of a flow with |k| <= 5.
+        assert 1e-3 < velocity_error(columns, 0) < 0.05 and velocity_error(columns, -1) < 0.08
+        simulate(MPI.COMM_SELF, folder, *form, "eulerian.start=particles")
+        alone = read(folder)[2]["model"]
+        # The solve ends at a residual of 2e-4 of the velocities.
+        assert np.abs(alone["velocity"] - columns["model"]["velocity"]).max() < 2e-3
     comm.Barrier()
 
 

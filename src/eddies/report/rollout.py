@@ -20,7 +20,7 @@ METHODS = {
     "learned": "the model, terms {terms}",
     "none": "no force: every particle keeps its velocity",
     "eulerian": "Eulerian large-eddy simulation on {cells}³ cells, |kᵢ| ≤ {largest_wavenumber}, {fluid}, {equations} "
-                "velocity, closure: {closure}",
+                "velocity, closure: {closure}, started from the {start}",
 }
 WITHOUT_KERNEL = "it needs velocity gradients from the smoothing kernel, and there is no kernel.h5"
 
@@ -28,7 +28,7 @@ WITHOUT_KERNEL = "it needs velocity gradients from the smoothing kernel, and the
 def moved_by(attributes: Mapping[str, float | str]) -> str:
     """Describe what moved the particles."""
     name = str(attributes["method"])
-    return METHODS.get(name, name).format_map(attributes)
+    return METHODS.get(name, name).format_map({"start": "flow", **attributes})  # older files have no start
 
 
 def section(run: Rollout, main: bool = True) -> Section:

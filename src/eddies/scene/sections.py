@@ -496,6 +496,8 @@ class Eulerian(Section):
                         default="incompressible")
     equations: str = choice("velocity of the equations; unfiltered: the whole velocity, whose filtered part moves the "
                             "particles; filtered: the filtered velocity", *EQUATIONS, default="unfiltered")
+    start: str = choice("modes at the start; flow: of the true flow; particles: those that least squares find in the "
+                        "velocities of the particles", "flow", "particles", default="flow")
     closure: str = choice("model of the scales that the grid, or the filter, leaves out; see Baselines",
                           *CLOSURES, default="none")
     smagorinsky: float = number("C_s of closure smagorinsky, the eddy viscosity (C_s Delta)^2 (2 S:S)^(1/2)",

@@ -22,7 +22,9 @@ from eddies.io.checkpoint import Checkpoint
 from eddies.io.weights import load_weights
 from eddies.parallel.migration import migrate
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.particle_set import ParticleSet
+from eddies.particles.flow_units import FlowUnits
+from eddies.particles.particle_set import ParticleSet, as_numpy
+from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Eulerian, Scene, SceneError
 from eddies.spectral.mode_operators import gaussian_transfer
@@ -40,8 +42,9 @@ RUNAWAY_ENERGY = 100.0
 class EulerianRun:
     """A fluid on a coarse grid, with or without a closure, that starts at a frame of the truth.
 
-    It starts from the modes of the unfiltered velocity that the grid holds. Equations for the filtered velocity start
-    from these modes after the filter. The particles follow the filtered velocity in both cases.
+    It starts from the modes of the unfiltered velocity that the grid holds: of the true flow, or those that particles
+    tell. Equations for the filtered velocity start from these modes after the filter. The particles follow the filtered
+    velocity in both cases.
     """
 
     def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:
@@ -60,7 +63,8 @@ class EulerianRun:
         self.fluid = FLUIDS[self.settings.fluid](grid, scene.flow.viscosity, sound_speed, forcing, closure=closure)
         self.stepper, self.clock = ETDRK4(self.fluid), Clock()
         self.step_limit = CourantLimit(grid, scene.time.courant, math.inf)
-        self.state = initial_state(truth, self.fluid, filter_passed, start)
+        state_of = {"flow": initial_state, "particles": state_of_particles}[self.settings.start]
+        self.state = state_of(truth, self.fluid, filter_passed, start)
         self.largest_energy = RUNAWAY_ENERGY * quadratic_energy(self.fluid, self.state)
         columns = truth.particles(start)
         columns = migrate(grid.decomposition, {name: columns[name] for name in ("id", "position")})
@@ -151,7 +155,7 @@ class EulerianRun:
         constant = f", C_s = {getattr(self.settings, key):g}" if key else ""
         return {"integrator": "etdrk4", "cells": grid.cells, "largest_wavenumber": grid.cutoff,
                 "fluid": self.settings.fluid, "equations": self.settings.equations,
-                "closure": self.settings.closure + constant, **seconds}
+                "closure": self.settings.closure + constant, "start": self.settings.start, **seconds}
 
 
 def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float, directory: Path,
@@ -207,3 +211,21 @@ def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame:
     if filter_passed:
         return np.concatenate([velocity, balanced_density(grid, velocity, fluid.sound_speed)[None]])
     return np.concatenate([velocity, kept(np.log(stored_planes("density")))])
+
+
+@torch.no_grad()
+def state_of_particles(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame: int) -> np.ndarray:
+    """The modes that least squares find in the velocities of the true particles at a frame (`ResolvedVelocity`), with
+    their filter undone or kept, and a density in balance.
+
+    Modes beyond those that the particles resolve are zero.
+    """
+    grid, scales = fluid.grid, truth.scales
+    units = FlowUnits(scales, cutoff=0.0, neighbors=0.0)  # no pairs
+    resolved = ResolvedVelocity.on_slabs(truth.decomposition, units).of(ParticleSet.from_numpy(truth.particles(frame)))
+    known = resolved.grid.spectral
+    modes = as_numpy(resolved.velocity if filter_passed else resolved.unfiltered)
+    velocity = grid.solenoidal(regrid(known, grid, modes).astype(grid.complex))
+    if not fluid.compressible:
+        return velocity
+    return np.concatenate([velocity, balanced_density(grid, velocity, fluid.sound_speed)[None]])
