@@ -237,6 +237,53 @@ def test_the_force_at_particles_that_resolve_their_velocity(comm):
     assert errors[ALL] < 0.02 < 0.1 < errors["pressure", "viscosity"]
 
 
+# ---- limits of the form, stated in docs/closure.md
+
+
+def abc_flow(position, wavenumber):
+    """Velocity (n, 3) of the ABC flow and its gradient (n, 3, 3) [component, direction]."""
+    x, y, z = wavenumber * position.T
+    gradient = np.zeros((len(position), 3, 3))
+    for component, direction, slope in ((0, 2, np.cos(z)), (0, 1, -np.sin(y)), (1, 0, np.cos(x)), (1, 2, -np.sin(z)),
+                                        (2, 1, np.cos(y)), (2, 0, -np.sin(x))):
+        gradient[:, component, direction] = wavenumber * slope
+    return np.stack([np.sin(z) + np.cos(y), np.sin(x) + np.cos(z), np.sin(y) + np.cos(x)], axis=1), gradient
+
+
+@one_rank
+def test_in_a_laminar_flow_energy_leaks_into_modes_that_it_lacks(comm):
+    """The filtered ABC flow at 16^3 random places: the acceleration is v.grad v - nu k^2 v, the stress is a gradient.
+    Undoing the filter amplifies what the solve leaks."""
+    side, wavenumber = 16, 3
+    width, slab = 2 * LENGTH / side, SlabDecomposition(comm, LENGTH, 28)
+    position = np.random.default_rng(1).random((side**3, 3)) * LENGTH
+    passed = math.exp(-((wavenumber * width) ** 2) / 24)
+    velocity, gradient = (passed * part for part in abc_flow(position, wavenumber))
+    exact = np.einsum("nij,nj->ni", gradient, velocity) - NU * wavenumber**2 * velocity
+    particles = ParticleSet(torch.arange(len(position)), torch.from_numpy(position), torch.from_numpy(velocity))
+    errors = {}
+    with torch.no_grad():
+        for words in (ALL, ("pressure", "viscosity")):
+            rates = ParticleDynamics(slab, terms_of(words, units(width, LENGTH / side)), 0.0).rates(particles)
+            errors[words] = error(rates.acceleration.numpy(), exact)
+    assert 0.02 < errors["pressure", "viscosity"] < 0.08 and errors["pressure", "viscosity"] < errors[ALL] < 0.15
+
+
+@one_rank
+def test_translation_by_half_a_cell_changes_the_force_by_the_error_of_the_splines(comm):
+    side, width = 16, 0.8
+    position = lattice_positions(3, side, 0, side**3, LENGTH)
+    field, slab = Filtered(MODES, width), SlabDecomposition(comm, LENGTH, 28)
+    lagrangian, particles = terms_of(ALL, units(width, LENGTH / side)), particles_in(field, position)
+    forces = []
+    for shift in (0.0, slab.spacing / 2, slab.spacing):
+        moved = replace(particles, position=(particles.position + shift) % LENGTH)
+        with torch.no_grad():
+            forces.append(ParticleDynamics(slab, lagrangian, 0.0).rates(moved).acceleration.numpy())
+    half, whole = (np.linalg.norm(force - forces[0]) / np.linalg.norm(forces[0]) for force in forces[1:])
+    assert 5e-4 < half < 4e-3 and whole < 1e-12
+
+
 # ---- forcing
 
 
