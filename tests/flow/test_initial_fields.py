@@ -19,6 +19,17 @@ def test_random_field_is_solenoidal_real_and_has_its_spectrum(comm):
     assert np.allclose(spectrum[:8] / spectrum[3], shape[:8] / shape[3], rtol=1e-12)
 
 
+@pytest.mark.mpi(1, 2)
+def test_a_field_of_a_given_spectrum_has_it_between_its_wavenumbers(comm):
+    """Interpolated in logarithms, so exact for a power law, and zero beyond."""
+    grid, given = make_grid(comm, 24), np.array([1.5, 3.0, 5.5])
+    velocity = initial_fields.velocity_of_spectrum(grid, 5, given, 0.3 * given**-2)
+    assert np.abs(grid.divergence(velocity)).max(initial=0) < 1e-15
+    k, spectrum = energy_spectrum(grid, velocity)
+    inside = (k >= 2) & (k <= 5)
+    assert np.allclose(spectrum[inside], 0.3 * k[inside] ** -2.0, rtol=1e-12) and not spectrum[~inside].any()
+
+
 @pytest.mark.mpi(1)
 def test_random_field_does_not_depend_on_the_resolution(comm):
     coarse, fine = make_grid(comm, 24), make_grid(comm, 36)

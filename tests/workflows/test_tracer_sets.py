@@ -1,13 +1,21 @@
 """Several sets of tracers in one direct simulation: each has the ground truth that it has alone."""
 
+import re
+import shutil
+
 import numpy as np
 import pytest
 
+from eddies.io.errors import WriteError
+from eddies.io.provenance import product_provenance
+from eddies.io.run_lock import RunInUse, lock_directory
 from eddies.parallel.stop import Stopped
-from eddies.scene.scene import SceneError, load_scene
-from eddies.workflows import dns
+from eddies.scene.scene import SceneError, Tracers, load_scene
+from eddies.workflows import dns, timing
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import find_work
+from eddies.workflows.status import status_lines
+from eddies.workflows.variant_rows import notes
 from eddies.workflows.variants import steps
 from tests.small_scene import TINY, problems_of
 from tests.workflows.stopping import StopAtStep
@@ -31,17 +39,19 @@ def test_a_set_has_the_ground_truth_that_it_has_alone(comm, tmp_path):
     assert sorted(path.name for path in together.iterdir()) == ["few", "ground_truth.h5", "whole"]
     truths = {}
     for name, own in scene.tracer_sets.items():
-        assert own == load_scene(TINY, [*SPLIT, *SETS, f"tracers.set={name}"])
-        dns.run(own, comm, tmp_path / name)
+        alone = own if name == "whole" else load_scene(TINY, [*SPLIT, *SETS, f"tracers.set={name}"])
+        assert stage_fingerprint(own, "dns") == stage_fingerprint(alone, "dns") and own.tracers == alone.tracers
+        dns.run(alone, comm, tmp_path / name)
         truths[name] = product(comm, tmp_path / name)
         found = product(comm, together / name)
         assert found.keys() == truths[name].keys()
+        states = found.pop("whole")  # of the whole flow, where rollouts of the scene may start
         for key, values in found.items():
             assert np.array_equal(values, truths[name][key]), (name, key)
+        assert len(states) > 0 and (name == "whole" or np.array_equal(states, truths[name]["whole"]))
     # Particles of the whole flow are faster, and start elsewhere.
     few, whole = (np.square(truths[name]["velocity"][0]).sum(axis=1).mean() for name in ("few", "whole"))
     assert whole > 1.05 * few and truths["whole"]["position"].shape[1] == 5**3
-    assert np.array_equal(truths["few"]["whole"], truths["whole"]["whole"])  # the same flow
 
 
 def with_variants(folder, **sets):
@@ -53,18 +63,39 @@ def with_variants(folder, **sets):
 
 @pytest.mark.mpi(1)
 def test_variants_use_the_sets(tmp_path):
-    scene = load_scene(with_variants(tmp_path, a="few", b="whole"), [
-        *SPLIT, *SETS, "realisations=[7]", "simulation.step=converged"])
+    scene = load_scene(with_variants(tmp_path, a="few", b="other", c="few"), [
+        *SPLIT, *SETS, "tracers.other.seed=2", "realisations=[7]", "simulation.step=converged"])
     planned = steps(scene, scene.stages_of_all, tmp_path)
     truths = [(step.directory.relative_to(tmp_path).as_posix(), step.files) for step in planned if "dns" in step.stages]
-    assert truths == [(name, [tmp_path / name / part / "ground_truth.h5" for part in ("", "few", "whole")])
+    assert truths == [(name, [tmp_path / name / part / "ground_truth.h5" for part in ("", "few", "whole", "other")])
                       for name in (".", "realisation-7")]
-    used = {step.directory.relative_to(tmp_path).as_posix(): step.links["dns"].relative_to(tmp_path).as_posix()
-            for step in planned if "dns" in step.links}
-    assert used == {"a": "few", "b": "whole", "a/realisation-7": "realisation-7/few",
-                    "b/realisation-7": "realisation-7/whole"}
+    used = {step.directory.relative_to(tmp_path).as_posix(): {link.relative_to(tmp_path).as_posix() for stage, link
+            in step.links.items() if stage in ("dns", "train-kernel")} for step in planned if "dns" in step.links}
+    assert used == {"a": {"few"}, "b": {"other"}, "c": {"few"}, "a/realisation-7": {"realisation-7/few"},
+                    "b/realisation-7": {"realisation-7/other"}, "c/realisation-7": {"realisation-7/few"}}
+    # A kernel belongs to its set, so that the failure of a variant does not concern another.
+    assert [step.directory.relative_to(tmp_path).as_posix() for step in planned if "train-kernel" in step.stages] == [
+        "few", "other", "realisation-7/few", "realisation-7/other"]
     (confirmed,) = {step.scene.simulation.confirmed_on for step in planned if step.directory == tmp_path / "a"}
     assert confirmed == (str(tmp_path / "realisation-7" / "few"),)
+    seen = f'training.truths=["{tmp_path / "realisation-7/few"}"]'
+    given = load_scene(with_variants(tmp_path, a="few"), [*SPLIT, *SETS, "realisations=[7]", seen])
+    with pytest.raises(SceneError, match="realisation-7/few/ground_truth.h5, which is a realisation"):
+        given.check_unseen(tmp_path)
+
+
+@pytest.mark.mpi(1)
+def test_realisations_of_sets_alone_are_ground_truths(tmp_path):
+    scene = load_scene(TINY, [*SPLIT, *SETS, "realisations=[7]"])
+    assert [(step.directory.name, step.stages) for step in steps(scene, scene.stages_of_all, tmp_path)] == [
+        (tmp_path.name, ("dns",)), ("realisation-7", ("dns",))]
+
+
+def test_variants_of_one_set_are_measured_alike(tmp_path):
+    keys = [*SPLIT, *SETS, "tracers.other.particles_per_side=4"]
+    alike, apart = (load_scene(with_variants(tmp_path, a="few", b=other), keys) for other in ("few", "other"))
+    assert not any("kernel" in line or "Compare" in line for line in notes(alike))
+    assert any(line.startswith("b: no ") for line in notes(apart)) and "Compare those with the same" in notes(apart)[-1]
 
 
 @pytest.mark.mpi(1)
@@ -74,7 +105,52 @@ def test_a_lost_ground_truth_of_a_set_is_made_again(comm, tmp_path):
     assert find_work(["dns"], scene, tmp_path).done == {"dns"}
     assert find_work(["dns"], scene.tracer_sets["few"], tmp_path / "few").done == {"dns"}
     (tmp_path / "few" / "ground_truth.h5").unlink()
-    assert not find_work(["dns"], scene, tmp_path).done
+    (tmp_path / "whole" / "scene.toml").write_text("# of another scene")
+    (tmp_path / "scene.toml").write_text(scene.to_toml())
+    (line,) = [line for line in status_lines(tmp_path) if line.startswith("  dns")]
+    assert line.endswith("lacks the ground truth of few")
+    work, kept = find_work(["dns"], scene, tmp_path), product_provenance(tmp_path / "whole" / "ground_truth.h5")
+    assert not work.done and not work.lost
+    dns.run(scene, comm, tmp_path)
+    assert product_provenance(tmp_path / "whole" / "ground_truth.h5") == kept  # what was made from it stays valid
+    assert (tmp_path / "whole" / "scene.toml").read_text() == "# of another scene"
+    assert find_work(["dns"], scene, tmp_path).done == {"dns"} and not list(tmp_path.glob("*/LOCK"))
+
+
+@pytest.mark.mpi(1)
+def test_work_in_the_directory_of_a_set_is_not_replaced(comm, tmp_path):
+    scene = load_scene(TINY, [*SPLIT, *SETS])
+    (tmp_path / "few").mkdir()
+    dns.run(load_scene(TINY, [*SPLIT, *SETS, "tracers.set=few", "seed=5"]), comm, tmp_path / "few")
+    (lost,) = find_work(["dns"], scene, tmp_path).lost
+    assert lost.startswith("few/ground_truth.h5 (made ")
+    with lock_directory(comm, tmp_path / "few"), pytest.raises(RunInUse, match="few: another job works here"):
+        dns.run(scene, comm, tmp_path)
+    shutil.rmtree(tmp_path / "few")
+    (tmp_path / "few").touch()
+    with pytest.raises(WriteError, match="few"):  # before the simulation
+        dns.run(scene, comm, tmp_path)
+    assert not (tmp_path / "checkpoints").exists()
+
+
+@pytest.mark.mpi(1)
+def test_a_stopped_simulation_with_sets_goes_on_for_longer(comm, tmp_path, caplog):
+    caplog.set_level("INFO", "eddies")
+    with pytest.raises(Stopped):
+        dns.run(load_scene(TINY, [*SPLIT, *SETS]), comm, tmp_path, StopAtStep(comm, 11))
+    longer = load_scene(TINY, [*SPLIT, *reversed(SETS), "tracers.turnovers=0.2"])  # also with the sets in another order
+    assert find_work(["dns"], longer, tmp_path).begun == {"dns"}
+    dns.run(longer, comm, tmp_path)
+    assert "continues from step 11" in caplog.text
+    assert not find_work(["dns"], load_scene(TINY, [*SPLIT, *SETS]), tmp_path).done
+
+
+@pytest.mark.mpi(1)
+def test_a_scene_with_sets_is_measured(comm, tmp_path, monkeypatch, caplog):
+    monkeypatch.chdir(tmp_path)
+    caplog.set_level("INFO", "eddies")
+    timing.run(load_scene(with_variants(tmp_path, a="few"), [*SPLIT, *SETS, "simulation.method=none"]), comm)
+    assert re.search(r"a: simulate +\S+ +\d+ ", caplog.text)
 
 
 @pytest.mark.mpi(1)
@@ -86,6 +162,8 @@ def test_sets_are_read_and_written(comm):
     assert scene.stages == ("dns", "report")
     assert "choose one of them" in " ".join(problems_of(scene, comm)[1])
     chosen = load_scene(TINY, [*SPLIT, *SETS, "tracers.set=few"])
+    assert stage_fingerprint(scene, "dns") == stage_fingerprint(
+        load_scene(TINY, [*SPLIT, "tracers.same={}", *reversed(SETS)]), "dns")
     assert not chosen.tracers.sets and chosen.tracers.set is None and "train-kernel" in chosen.stages
     longer = load_scene(TINY, [*SPLIT, *SETS, "tracers.turnovers=0.2"])
     assert {each.turnovers for each in longer.tracers.all} == {0.2}
@@ -94,7 +172,8 @@ def test_sets_are_read_and_written(comm):
 
 @pytest.mark.mpi(1)
 def test_written_sets_are_read_back(comm, tmp_path):
-    scene = load_scene(TINY, [*SPLIT, *SETS, "tracers.same={}"])
+    scene = load_scene(TINY, [*SPLIT, *SETS, "tracers.same={}", "tracers.few.field_cells=none"])
+    assert scene.tracers.field_cells == 8 and scene.tracers.sets["few"].field_cells is None
     path = tmp_path / "scene.toml"
     path.write_text(scene.to_toml())
     assert load_scene(path) == scene
@@ -106,11 +185,21 @@ def test_written_sets_are_read_back(comm, tmp_path):
     (["tracers.few.turnovers=3"], r"\[tracers.few\] turnovers: no key of a set; the sets share all keys .* but partic"),
     (["tracers.few.filter_width=-1"], r"\[tracers.few\] filter_width = -1: must be a number above 0"),
     (["tracers.set=fewer"], r'\[tracers\] set = "fewer": there is no section \[tracers.fewer\]; there are: few, whole'),
-    (["tracers.few.field_cells=90"], r"\[tracers\] field_cells.*must be at most \[flow\] cells = 12"),
+    (["tracers.few.field_cells=90"], r"\[tracers\]: set few: field_cells must be at most \[flow\] cells = 12"),
+    (["tracers.set=whole"], r"\[tracers\] filtered = false: these particles follow the whole .* remove \[kernel\]"),
     (["tracers.report.seed=1"], r"\[tracers\]: set report: a run directory uses this name")])
 def test_wrong_sets_are_refused(keys, complaint):
     with pytest.raises(SceneError, match=complaint):
         load_scene(TINY, [*SPLIT, *SETS, *keys])
+
+
+def test_a_program_gives_sets_as_tables_or_objects():
+    few = Tracers(particles_per_side=4, turnovers=1.0, frame_interval=0.1)
+    for own in ({"particles_per_side": 4}, few):
+        given = Tracers(particles_per_side=5, turnovers=2.0, frame_interval=0.1, sets={"few": own})
+        assert (given.sets["few"].particles_per_side, given.sets["few"].turnovers) == (4, 2.0)
+    with pytest.raises(SceneError, match="tracers.few: must be a section"):
+        Tracers(particles_per_side=5, turnovers=2.0, frame_interval=0.1, sets={"few": 3})
 
 
 @pytest.mark.mpi(1)

@@ -12,12 +12,34 @@ def random_velocity(grid: SpectralGrid, seed: int, amplitude: float, peak_wavenu
     `amplitude` is the rms of one component. Random numbers are keyed by (seed, ky, kz) and drawn along kx, so the field
     depends neither on the number of ranks nor on the resolution. Every shell has exactly its energy.
     """
+    velocity, energy = _gaussian_solenoidal(grid, seed)
+    k = np.arange(len(energy))
+    target = k**4 * np.exp(-2 * (k / peak_wavenumber) ** 2)
+    return _with_spectrum(grid, velocity, energy, target * 1.5 * amplitude**2 / target[energy > 0].sum())
+
+
+def velocity_of_spectrum(grid: SpectralGrid, seed: int, wavenumber: np.ndarray, energy: np.ndarray) -> np.ndarray:
+    """Return a Gaussian solenoidal velocity (3, kz, ky, kx) with a spectrum given at ascending wavenumbers.
+
+    E(k) is interpolated in logarithms between them and zero beyond them. Random numbers are those of `random_velocity`.
+    """
+    velocity, present = _gaussian_solenoidal(grid, seed)
+    given = energy > 0
+    k = np.maximum(np.arange(len(present)), 1e-9)
+    target = np.exp(np.interp(np.log(k), np.log(wavenumber[given]), np.log(energy[given]), left=-np.inf, right=-np.inf))
+    return _with_spectrum(grid, velocity, present, target)
+
+
+def _gaussian_solenoidal(grid: SpectralGrid, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a solenoidal velocity of normal numbers without a mean, and its spectrum."""
     velocity = grid.solenoidal(_gaussian_modes(grid, seed))
     velocity[:, grid.index_squared == 0] = 0
-    k, energy = energy_spectrum(grid, velocity)
-    target = k**4 * np.exp(-2 * (k / peak_wavenumber) ** 2)
-    target *= 1.5 * amplitude**2 / target[energy > 0].sum()
-    scale = np.sqrt(np.divide(target, energy, out=np.zeros(len(k)), where=energy > 0))
+    return velocity, energy_spectrum(grid, velocity)[1]
+
+
+def _with_spectrum(grid: SpectralGrid, velocity: np.ndarray, energy: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return a velocity whose shells with the spectrum `energy` have the spectrum `target`."""
+    scale = np.sqrt(np.divide(target, energy, out=np.zeros(len(energy)), where=energy > 0))
     return (velocity * scale[grid.shell_number]).astype(grid.complex)
 
 

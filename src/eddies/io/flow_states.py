@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -226,3 +227,25 @@ def _read_planes(dataset: h5py.Dataset, start: int, stop: int | None) -> np.ndar
 
 def _place(dataset: h5py.Dataset) -> str:
     return f"{dataset.file.filename}: {dataset.name.lstrip('/')}"
+
+
+def read_spectrum(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Ascending wavenumbers and the energies E(k) >= 0 of a text file with both in each line; # begins a comment.
+
+    One rank calls it. Raises ProductError for another content.
+    """
+    try:
+        with warnings.catch_warnings(action="ignore"):  # of an empty file
+            table = np.loadtxt(path, ndmin=2, encoding="utf-8")
+    except OSError as error:
+        raise unreadable(path, error) or ProductError(f"{path}: cannot be read") from None
+    except ValueError as error:
+        raise ProductError(f"{path}: holds no spectrum ({error}); write a wavenumber and E(k) in each line") from None
+    if table.shape[1] != 2 or not np.isfinite(table).all():
+        raise ProductError(f"{path}: has {table.shape[1]} columns, or numbers that are not finite; write a wavenumber "
+                           "and E(k) in each line")
+    wavenumber, energy = table.T
+    if wavenumber[0] <= 0 or (np.diff(wavenumber) <= 0).any() or (energy < 0).any() or (energy > 0).sum() < 2:
+        raise ProductError(f"{path}: must have ascending wavenumbers above 0, and energies of at least 0, two of them "
+                           "above")
+    return wavenumber, energy

@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Collection, Iterator, Sequence
 
-from eddies.import_path import ImportPathError, load
+from eddies.import_path import ImportPathError, is_path, load
 from eddies.pipeline import STAGES
 from eddies.scene.model import Model
 from eddies.scene.sections import (INITIAL_FLOWS, Eulerian, Flow, Forcing, Initial, InitialFlow, Kernel, Simulation,
@@ -84,8 +84,9 @@ def check_flow(flow: Flow, initial: Initial, forcing: Forcing | None, model: Mod
         yield "flow.sound_speed", "this key is missing; a compressible fluid needs a number above 0"
     if not flow.compressible and flow.sound_speed is not None:
         yield "flow.sound_speed", 'an incompressible fluid has none; remove it or set fluid = "compressible"'
-    if initial.flow.from_file and initial.path is None:
-        yield "initial.path", 'this key is missing; kind = "file" needs the path of an HDF5 file'
+    if "path" in initial.flow.keys and initial.path is None and not is_path(initial.kind):
+        wanted = "an HDF5 file" if initial.flow.from_file else "a text file"
+        yield "initial.path", f'this key is missing; kind = "{initial.kind}" needs the path of {wanted}'
     if initial.flow.sound and not flow.compressible:
         yield "initial.kind", 'needs sound; set [flow] fluid = "compressible"'
     if model and initial.flow.steady and flow.viscosity == 0 and forcing is None:
@@ -130,11 +131,20 @@ def check_tracers(tracers: Tracers, flow: Flow, initial: Initial) -> Problems:
     if initial.flow.sound:
         yield "initial.kind", ("starts from rest and has no turnover time, in which [tracers] turnovers are counted; "
                                "choose another kind, or remove [tracers]")
-    for each in tracers.all:
+    for name, each in (tracers.sets or {"": tracers}).items():
         if each.cells > flow.cells:
+            key = f"set {name}: field_cells " if name else ""
             default = "" if each.field_cells else f"is {each.cells} (from particles_per_side) and "
-            yield "tracers.field_cells", (f"{default}must be at most [flow] cells = {flow.cells}; lower field_cells "
-                                          "or raise cells")
+            yield f"tracers{'' if name else '.field_cells'}", (
+                f"{key}{default}must be at most [flow] cells = {flow.cells}; lower field_cells or raise cells")
+
+
+def check_filtered(tracers: Tracers, present: Collection[str]) -> Problems:
+    """Particles of the whole flow in a scene that learns from them or rolls them out."""
+    made = [f"[{name}]" for name in ("kernel", "model", "training", "simulation") if name in present]
+    if not tracers.filtered and made:
+        yield "tracers.filtered", ("these particles follow the whole flow, but kernels, models and rollouts are those "
+                                   f"of a filtered velocity; choose another set, or remove {', '.join(made)}")
 
 
 def check_sets(tracers: Tracers, variants: Collection[str]) -> Problems:

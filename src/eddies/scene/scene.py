@@ -83,9 +83,9 @@ class Scene(Section):
 
     @property
     def tracer_sets(self) -> "dict[str, Scene]":
-        """The scenes of the sets of tracers by name, without variants; each has chosen its set."""
-        whole = self.without_variants
-        return {name: replace(whole, tracers=own) for name, own in (self.tracers.sets if self.tracers else {}).items()}
+        """The scenes of the ground truths of the sets of tracers, by name of the set."""
+        sets = self.tracers.sets if self.tracers else {}
+        return {name: replace(self.ground_truth_alone, tracers=own) for name, own in sets.items()}
 
     # ---- values that follow from several sections
 
@@ -223,10 +223,11 @@ class Scene(Section):
         for name, variant in (self.variant or {self.name: self}).items():
             trained_on = [path.resolve() for path in variant.training.truth_files] if variant.training else []
             for seed in self.realisations or ():
-                path = directory / f"{REALISATION}{seed}" / STAGES["dns"].file
-                if path.resolve() in trained_on:
-                    raise SceneError(f"{name}: [training] truths names {path}, which is a realisation; remove {seed} "
-                                     "from realisations")
+                for part in ("", *(self.tracers.sets if self.tracers else ())):
+                    path = directory / f"{REALISATION}{seed}" / part / STAGES["dns"].file
+                    if path.resolve() in trained_on:
+                        raise SceneError(f"{name}: [training] truths names {path}, which is a realisation; remove "
+                                         f"{seed} from realisations")
 
     def _problems(self) -> checks.Problems:
         """Yield the problems of names, of sections side by side, and of variants, each with the key at fault."""
@@ -239,15 +240,18 @@ class Scene(Section):
         if tracers is not None:
             yield from checks.check_tracers(tracers, flow, self.initial)
             yield from checks.check_sets(tracers, self.variant)
+        if tracers is not None and not tracers.sets:
+            yield from checks.check_filtered(tracers, present)
             for name, neighbors in (("kernel", kernel and kernel.neighbors), ("model", model and model.neighbors)):
                 yield from checks.check_reach(name, neighbors or 0.0, tracers, simulation.skin if simulation else 0.0)
         yield from checks.check_needs(present, self.needs_model, model is not None and model.path is not None)
         yield from checks.check_density(flow, model, simulation)
-        if self.training is not None:
+        if self.training is not None and not (tracers and tracers.sets):
             yield from checks.check_training(self.training, tracers, kernel)
         if simulation is not None and tracers is not None:
             yield from checks.check_simulation(simulation, tracers, self.seen_in(self.directory))
-        yield from checks.check_coarse_grid(self.eulerian, self.coarse_cells, flow, model)
+        if not (tracers and tracers.sets):
+            yield from checks.check_coarse_grid(self.eulerian, self.coarse_cells, flow, model)
         for name in self.variant:
             yield from ((f"{VARIANT}.{name}", problem) for problem in self._problems_of_variant(name))
 

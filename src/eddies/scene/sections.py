@@ -82,6 +82,7 @@ INITIAL_FLOWS = {
     "abc": InitialFlow(("amplitude", "wavenumber"), rms=math.sqrt(3), peak=3 * math.sqrt(2)),
     "shear-wave": InitialFlow(("amplitude", "wavenumber"), rms=math.sqrt(0.5), peak=1.0, steady=True),
     "sound-wave": InitialFlow(("amplitude", "wavenumber"), sound=True),
+    "spectrum": InitialFlow(("path",)),
     "file": InitialFlow(("path", "state")),
 }
 
@@ -96,7 +97,7 @@ class Initial(Section):
     peak_wavenumber: float = number("wavenumber of the spectrum's peak, random only", default=3.0, at_least=0.1)
     wavenumber: int = integer("number of waves in the cube; abc, shear-wave, sound-wave only", default=1, at_least=1)
     path: str | None = text("file to start from, on any grid: ground_truth.h5 or its run directory, JHTDB cutout or "
-                            "fluidsim state; kind file only", default=None)
+                            "fluidsim state; kind spectrum: a text file with k and E(k) in each line", default=None)
     state: int = integer("index in time of the state in this file: fields/final, with tracers fields/unfiltered, in a "
                          "cutout velocity_####", default=0, at_least=0)
 
@@ -200,6 +201,8 @@ class Tracers(Section):
         """A set from its table, or from an object whose other keys are those of this section."""
         if isinstance(own, Tracers):
             return dataclasses.replace(self, sets={}, set=None, **{key: getattr(own, key) for key in OF_A_SET})
+        if not isinstance(own, dict):
+            raise SceneError(f"tracers.{name}: must be a section; write [tracers.{name}] and its keys below")
         for key in own:
             if key not in OF_A_SET:
                 raise KeyProblem(f"tracers.{name}", key, ": no key of a set; the sets share all keys of [tracers] but "

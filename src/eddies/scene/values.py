@@ -221,7 +221,11 @@ def write_section(section: Section, name: str = "", all_keys: bool = False) -> l
         elif field.name == section._holder:
             for key, part in value.items():
                 written = [line for line in write_section(part, all_keys=all_keys) if line not in lines]
-                if written or isinstance(part, type(section)):
+                same = isinstance(part, type(section))
+                if same:  # a key of the outer section holds where the inner one lacks it
+                    written += [f'{each.name} = "{ABSENT}"' for each in dataclasses.fields(part)
+                                if getattr(part, each.name) is None and getattr(section, each.name) is not None]
+                if written or same:
                     inner += ["", f"[{name}.{key}]", *written]
     return lines + inner
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -20,6 +20,7 @@ from eddies.io.hdf5 import (File, ProductError, create_product, in_files, open_p
                             write_table)
 from eddies.io.new_files import write_files
 from eddies.io.provenance import product_provenance
+from eddies.io.run_lock import lock_directory
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
@@ -32,7 +33,7 @@ from eddies.workflows.ground_truth.flow_run import FlowRun, TracerRun, frame_lay
 from eddies.workflows.ground_truth.frame_counts import whole_frames
 from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
 from eddies.workflows.problems import check_span
-from eddies.workflows.run_directory.fingerprints import DURATIONS, stage_fingerprint, stage_provenance
+from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, stage_fingerprint, stage_provenance
 
 log = logging.getLogger("eddies")
 
@@ -54,7 +55,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     requests it.
     """
     directory = Path(directory)
-    product, course = directory / STAGES["dns"].file, stage_fingerprint(scene, "dns", DURATIONS["dns"])
+    product, course = directory / STAGES["dns"].file, stage_fingerprint(scene, "dns", DURATION_KEYS["dns"])
     guard = Guard(comm, directory / STAGES["dns"].checkpoints, course, stop)
     saved, fluid = guard.checkpoints.newest(), build_fluid(scene.flow, scene.forcing, comm)
     origin = on_first_rank(comm, lambda: product_provenance(product))
@@ -75,7 +76,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     provenance = {**stage_provenance(scene, "dns"), "course": course, "duration": scene.duration}
     if same_course and saved is not None and scene.tracers is not None:
         provenance["id"] = origin["id"]  # its frames stay, and so does what was made from them
-    with create_product(comm, product, "ground_truth", provenance) as file:
+    sets = scene.tracer_sets
+    with holding(comm, [directory / name for name in sets]), create_product(
+            comm, product, "ground_truth", provenance) as file:
         if saved is None:
             flow.history.sample(flow.state, flow.clock)
         if flow.phase == "spin-up":
@@ -85,7 +88,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 saved = None
                 span = scene.tracers.turnovers * flow.history.sample(flow.state, flow.clock)["eddy_turnover_time"]
                 check_span(scene.time, span, flow.step_limit.bound(flow.state, flow.clock), scene.tracers)
-            layout, sets = frame_layout(scene.tracers, fluid.compressible, fluid.grid.cutoff), scene.tracer_sets
+            layout = frame_layout(scene.tracers, fluid.compressible, fluid.grid.cutoff)
             before = () if saved is None else saved.files or [f"../{product.name}"]
             with FrameSegments(comm, guard.checkpoints.path, layout, before) as parts:
                 whole = partial(whole_frames, scene.simulation, scene.training, scene.tracers.field_every)
@@ -96,7 +99,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 final = flow.state_dict()
                 last = flow.history.sample(flow.state, flow.clock)
                 for name, own in sets.items():
-                    path = directory / name / product.name
+                    path, mark = directory / name / product.name, stage_fingerprint(own, "dns")
+                    if in_files(comm, path, partial(is_made, path, mark)):
+                        continue  # what was made from it stays valid
                     in_files(comm, path, partial(prepare_set, path.parent, own.to_toml()))
                     with create_product(comm, path, "ground_truth", stage_provenance(own, "dns")) as part:
                         write_tracers(part, tracers, name, parts, own.forcing)
@@ -116,14 +121,28 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             scales = scales_of(flow.history.sample(flow.state, flow.clock))
         write_flow(file, flow, scales, scene.spin_up)
     guard.checkpoints.remove()
-    if not scene.tracer_sets:
+    if not sets:
         guard.checkpoints.write(flow.steps, final)
 
 
+@contextmanager
+def holding(comm: Comm, directories: Sequence[Path]) -> Iterator[None]:
+    """Hold the run directories of sets of tracers, which are made if they are missing; collective."""
+    with ExitStack() as locks:
+        for directory in directories:
+            locks.enter_context(lock_directory(comm, directory))
+        yield
+
+
+def is_made(path: Path, fingerprint: str) -> bool:
+    """Whether a ground truth has been made with these settings."""
+    return product_provenance(path).get("fingerprint") == fingerprint
+
+
 def prepare_set(directory: Path, scene: str) -> None:
-    """Make the run directory of a set of tracers, with the text of its scene."""
-    directory.mkdir(exist_ok=True)
-    write_files({directory / "scene.toml": scene})
+    """Write the text of the scene of a set of tracers, unless another scene works in its directory."""
+    if not (directory / "scene.toml").exists():
+        write_files({directory / "scene.toml": scene})
 
 
 def write_tracers(file: File, tracers: TracerRun, name: str, parts: FrameSegments, forcing: Forcing | None) -> None:

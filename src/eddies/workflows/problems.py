@@ -29,7 +29,7 @@ from eddies.workflows.foreseen.numbers import Estimates, Turbulence, estimate
 from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
 from eddies.workflows.foreseen.storage import Disk, disk, in_units, memory, most_disk
 from eddies.workflows.ground_truth.frame_counts import check_frames
-from eddies.workflows.ground_truth.scene_flow import stored_states
+from eddies.workflows.ground_truth.scene_flow import given_spectrum, stored_states
 from eddies.workflows.variants import Step, steps
 
 LARGEST_MACH = 0.3           # turbulent Mach number; density fluctuations are of about its square
@@ -225,6 +225,8 @@ def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str
         if "dns" in stages and scene.initial.flow.from_file:
             with stored_states(scene.initial, comm):
                 pass
+        if "dns" in stages and scene.initial.kind == "spectrum":
+            given_spectrum(scene.initial, comm)
         weights = model.weights_file if model is not None else None
         if weights is not None and weights not in made and on_first_rank(comm, weights.is_file):
             from eddies.workflows.learned.source import read_source  # imports torch

@@ -13,14 +13,14 @@ from eddies.io.checkpoint import checkpoints_in
 from eddies.io.checksums import ATTRIBUTE, find_damage, open_to_read
 from eddies.io.errors import ProductError, make_again
 from eddies.io.hdf5 import in_files
-from eddies.io.provenance import product_provenance
+from eddies.io.provenance import product_fingerprint, product_provenance
 from eddies.io.run_lock import find_lock
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows.foreseen.storage import in_units
-from eddies.workflows.run_directory.fingerprints import DURATIONS, stage_fingerprint
+from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, set_files, stage_fingerprint
 from eddies.workflows.run_directory.work import changed_settings, of_other_settings, stage_seconds
 from eddies.workflows.variants import steps
 
@@ -103,16 +103,20 @@ def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
         return
     yield f"{directory}  {size}{job}: {scene.title}"
     planned = steps(scene, tuple(STAGES), directory)
-    inner |= {step.directory for step in planned}
+    inner |= {file.parent for step in planned for file in step.files}
     rows = []
     for step in planned:
         seconds, prefix = stage_seconds(step.directory), ""
         if step.directory != directory:
             prefix = f"{step.directory.relative_to(directory)}: "
         own, text = partial(stage_fingerprint, step.scene), step.scene.to_toml()
-        rows += [(prefix + name, seconds.get(name), stage_state(
-            STAGES[name], step.directory, own(name), own(name, DURATIONS.get(name, ())), text))
-            for name in step.stages if name in step.scene.stages]
+        for name in [name for name in step.stages if name in step.scene.stages]:
+            state = stage_state(STAGES[name], step.directory, own(name), own(name, DURATION_KEYS.get(name, ())), text)
+            lacking = [path.parent.name for path, mark in (set_files(step.scene) if name == "dns" else {}).items()
+                       if product_fingerprint(step.directory / path) != mark]
+            if lacking and state.startswith("complete"):
+                state = f"lacks the ground truth of {', '.join(lacking)}"
+            rows.append((prefix + name, seconds.get(name), state))
     page, products = directory / PAGE, [step.directory / STAGES[name].file for step in planned for name in step.stages]
     state = "to do"
     if page.is_file():

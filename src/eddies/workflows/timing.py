@@ -70,7 +70,8 @@ def run(scene: Scene, comm: Comm, signals: Sequence[int] = ()) -> None:
                 with quiet():
                     dns.run(few.without_variants, comm, directory, stop)
                 # The measured run must not continue this one.
-                in_files(comm, directory, lambda: shutil.rmtree(directory / STAGES["dns"].checkpoints))
+                in_files(comm, directory, lambda: shutil.rmtree(directory / STAGES["dns"].checkpoints,
+                                                                ignore_errors=True))
                 reference = product_attributes(directory / STAGES["dns"].file, "reference")
                 few = shortened(scene, reference["eddy_turnover_time"])
             for step in steps(few, scene.stages_of_all, directory):

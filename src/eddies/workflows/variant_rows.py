@@ -56,7 +56,7 @@ def row(scene: Scene, name: str, places: Sequence[Place], realised: Sequence[Map
         found |= together(realised)
         first, own = places[0].directory, places[0].scene
         found |= before(first / MODEL if own.needs_model else None, step_path(own.simulation, first), alone)
-        if _kernel_of(variant) != _kernel_of(scene.without_variants):
+        if _kernel_of(variant) != _kernel_of(_measure_of(scene)):
             found |= dict.fromkeys(THROUGH_KERNEL)
     else:
         found["status"] = why_not(next(place.directory for place in places
@@ -117,17 +117,25 @@ def notes(scene: Scene) -> list[str]:
     found = [f"Mean and standard deviation over {len(seeds)} realisations, seeds {', '.join(map(str, seeds))}, that no "
              "training has seen." if seeds and len(seeds) > 1 else
              "All numbers are from one realisation, so small differences may be due to chance."]
-    own = [name for name, variant in variants.items() if _kernel_of(variant) != _kernel_of(scene.without_variants)]
+    own = [name for name, variant in variants.items() if _kernel_of(variant) != _kernel_of(_measure_of(scene))]
     if own:
         blank = " and ".join(MEASURES[measure] for measure in THROUGH_KERNEL)
         found.append(f"{', '.join(own)}: no {blank}. These numbers need the smoothing kernel, and a kernel with other "
-                     "settings than the scene's would give values that cannot be compared.")
+                     "settings would give values that cannot be compared.")
     grids = {name: variant.coarse_cells for name, variant in variants.items() if variant.coarse_cells}
     if grids:
         kept = ", ".join(f"{(cells - 1) // 3} in {name}" for name, cells in grids.items())
+        widths = {variants[name].tracers.filter_width for name in grids}
         found.append(f"Largest wavenumber |k_i| that a grid keeps by the 2/3 rule: {kept}; k_d = "
-                     f"{np.pi / scene.tracers.filter_width:.3g}.")
+                     f"{', '.join(f'{np.pi / width:.3g}' for width in sorted(widths, reverse=True))}.")
+    if len({(variant.tracers.particles, variant.tracers.filter_width) for variant in variants.values()}) > 1:
+        found.append("Variants have different particles or filters. Compare those with the same ones.")
     return found
+
+
+def _measure_of(scene: Scene) -> Scene:
+    """Return the scene whose kernel measures all variants: that of the whole or, with sets of tracers, of the first."""
+    return next(iter(scene.variant.values())) if scene.tracers.sets else scene.without_variants
 
 
 def numbers(stored: MeasuredRollout) -> dict[str, Any]:

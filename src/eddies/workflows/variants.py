@@ -82,10 +82,13 @@ class Place:
 
 
 def rollouts(scene: Scene, directory: Path) -> dict[str, list[Place]]:
-    """The rollouts of each variant, one for each realisation. A scene without variants counts as one variant."""
+    """The rollouts of each variant, one for each realisation. A scene without variants counts as one variant, unless it
+    has sets of tracers."""
     found = {}
     for name in scene.variant or (None,):
         own, where = scene.variant[name] if name else scene.without_variants, directory / (name or "")
+        if own.tracers is not None and own.tracers.sets:
+            continue
         if scene.realisations is None:
             found[name or scene.name] = [Place(own, where)]
             continue
@@ -113,13 +116,20 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
     # The ground truths that a variant may use, each by its directory below that of the scene or of a realisation.
     truths = {mark: path.parent for path, mark in set_files(whole).items()} or {stage_fingerprint(whole, "dns"): Path()}
     realisations = tuple(directory / f"{REALISATION}{seed}" for seed in seeds)
-    planned = [(None, Place(whole, directory), SHARED)]
-    for seed, place in zip(seeds, realisations):
-        # A ground truth for rollouts from its beginning; no model is needed here.
-        simulation = whole.simulation and replace(whole.simulation, method="none", start=0.0, confirmed_on=None)
-        truth = replace(whole, seed=seed, model=None, training=None, eulerian=None, simulation=simulation)
-        planned.append((None, Place(truth, place), SHARED))
-    chosen: Sequence[str | None] = [*names] or [*scene.variant] or [None]
+    places = rollouts(scene, directory)
+    chosen: Sequence[str | None] = [name for name in [*names] or [*scene.variant] or [None]
+                                    if (name or scene.name) in places]
+    used = [scene.variant[name].tracers if name else whole.tracers for name in chosen]
+    planned: list[tuple[str | None, Place, Sequence[str]]] = []
+    # A ground truth for rollouts from its beginning; no model is needed there.
+    simulation = whole.simulation and replace(whole.simulation, method="none", start=0.0, confirmed_on=None)
+    truth = replace(whole, model=None, training=None, eulerian=None, simulation=simulation)
+    for own, where in [(whole, directory), *((replace(truth, seed=seed), place)
+                                             for seed, place in zip(seeds, realisations))]:
+        planned.append((None, Place(own, where), SHARED))
+        for name, tracers in own.tracers.sets.items() if own.tracers else ():
+            if tracers in used:  # the kernel is beside the ground truth of the set
+                planned.append((None, Place(replace(own, tracers=tracers), where / name), ("train-kernel",)))
     for name in chosen:
         own = scene.variant[name] if name else whole
         if seeds and own.simulation.finds_step and own.simulation.confirmed_on is None and (
@@ -129,7 +139,6 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
             own = replace(own, simulation=replace(own.simulation, confirmed_on=confirmed_on))
         trained = ("train",) if not seeds or own.model is not None and own.model.path is None else ()
         planned.append((name, Place(own, directory / (name or "")), (*SHARED, *trained, "find-step")))
-    places = rollouts(scene, directory)
     for together in zip(*(places[name or scene.name] for name in chosen)):
         planned += [(name, place, (*SHARED, *(("train",) if seeds else ()), "simulate"))
                     for name, place in zip(chosen, together)]

@@ -82,6 +82,10 @@ def test_ghost_planes_limit_the_ranks():
     for overrides, ghosts in ((["simulation.step=0.2"], 3), (["simulation.skin=1"], 4)):
         assert most_ranks(load_scene(TINY, overrides))["ghost planes of the resolved velocity"] == 20 // ghosts
     assert "ghost planes of the resolved velocity" not in most_ranks(load_scene(TINY, ["model.preset=paper"]))
+    coarse = ["model.preset=paper", "simulation.method=eulerian", "eulerian.cells=24"]
+    for first, most in (("flow", None), ("particles", 20 // 3)):
+        limits = most_ranks(load_scene(TINY, [*coarse, f"eulerian.start={first}"]))
+        assert limits.get("ghost planes of the resolved velocity") == most
 
 
 def test_what_no_term_reads_limits_no_ranks():

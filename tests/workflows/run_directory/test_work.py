@@ -10,7 +10,7 @@ from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.hdf5 import ProductError, create_product
 from eddies.pipeline import STAGES
 from eddies.scene.scene import load_scene
-from eddies.workflows.run_directory.fingerprints import DURATIONS, stage_fingerprint, stage_provenance
+from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, stage_fingerprint, stage_provenance
 from eddies.workflows.run_directory.work import WorkAtStake, find_work
 from tests.small_scene import TINY
 
@@ -103,7 +103,7 @@ def test_checkpoints_of_other_settings_are_work_too(comm, tmp_path, scene):
 @pytest.mark.parametrize("turnovers, begun, lost", [(0.7, True, []), (0.5, False, ["ground_truth.h5"])])
 def test_the_last_state_of_a_ground_truth_is_for_longer_ones(comm, tmp_path, scene, turnovers, begun, lost):
     """The scene's own has 0.6 turnovers. Its last state is not listed beside it."""
-    course = {"course": stage_fingerprint(scene, "dns", DURATIONS["dns"]), "duration": scene.duration}
+    course = {"course": stage_fingerprint(scene, "dns", DURATION_KEYS["dns"]), "duration": scene.duration}
     CheckpointDirectory(comm, tmp_path / "checkpoints", course["course"]).write(9, {})
     provenance = stage_provenance(scene, "dns") | course
     with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", provenance):

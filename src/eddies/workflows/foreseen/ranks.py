@@ -50,6 +50,8 @@ def most_ranks(scene: Scene) -> dict[str, int]:
         farther = math.ceil(max(scene.time.courant, MOST_COURANT * simulation.finds_step)) - 1
         ghosts = GHOST_PLANES[tracers.interpolation] + farther
         limits["ghost planes of the coarse grid"] = max(scene.coarse_cells // ghosts, 1)
+        if scene.eulerian and scene.eulerian.start == "particles":
+            limits[RESOLVED] = resolved_grid_ranks(tracers, 0.0)
     elif scene.injects:
         limits[RESOLVED] = resolved_grid_ranks(tracers, skin / 2)
     fewest = min(limits.values())

@@ -84,6 +84,9 @@ def disk(scene: Scene, stage: str) -> Disk:
             trajectory_bytes(flow, tracers, frames,
                              len(whole_frames(scene.simulation, scene.training, tracers.field_every, frames)))
             for frames in (intervals or 0, (intervals or 0) + 1))
+        if tracers.sets:  # each with the statistics, beside a ground truth with the final fields and no last state
+            after += len(tracers.sets) * statistics + 4 * flow.components * flow.cells**3
+            state = 0
         return Disk(None if intervals is None else state + statistics + after, checkpoints + during, state)
     if stage == "train-kernel":  # planes of five reconstructions, velocity and gradient
         return Disk(PRODUCT_BYTES + 80 * tracers.cells**2 + 64 * scene.kernel.steps)

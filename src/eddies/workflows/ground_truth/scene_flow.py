@@ -11,12 +11,12 @@ import numpy as np
 
 from eddies.flow.courant import CourantLimit, FixedStep
 from eddies.flow.forcing import LinearForcing
-from eddies.flow.initial_fields import INITIAL_FLOWS, balanced_density, sound_wave_density
+from eddies.flow.initial_fields import INITIAL_FLOWS, balanced_density, sound_wave_density, velocity_of_spectrum
 from eddies.flow.navier_stokes import FLUIDS, Fluid
 from eddies.import_path import is_path, load, users_code
 from eddies.io.errors import ProductError
-from eddies.io.flow_states import StoredStates, VelocityCubes, open_states
-from eddies.parallel.broadcast import on_all_ranks
+from eddies.io.flow_states import StoredStates, VelocityCubes, open_states, read_spectrum
+from eddies.parallel.broadcast import on_all_ranks, on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.rules import quoted
@@ -53,6 +53,8 @@ def initial_state(initial: Initial, seed: int, fluid: Fluid) -> np.ndarray:
         return _state_from_file(initial, fluid)
     if is_path(initial.kind):
         velocity = _velocity_of_user(initial, seed, grid)
+    elif initial.kind == "spectrum":
+        velocity = velocity_of_spectrum(grid, seed, *given_spectrum(initial, grid.decomposition.comm))
     else:
         velocity = INITIAL_FLOWS[initial.kind](grid, initial, seed)
     if not fluid.compressible:
@@ -75,6 +77,14 @@ def _velocity_of_user(initial: Initial, seed: int, grid: SpectralGrid) -> np.nda
         raise SceneError(f'[initial] kind = "{initial.kind}": returned {returned}; must be the modes (3, kz, ky, kx) = '
                          f"{shape} of the velocity on this rank, such as grid.forward(velocity) gives")
     return grid.solenoidal(velocity.astype(grid.complex))
+
+
+def given_spectrum(initial: Initial, comm: Comm) -> tuple[np.ndarray, np.ndarray]:
+    """Wavenumbers and E(k) of the file of [initial] path; all ranks call it. Raises SceneError if it is unfit."""
+    try:
+        return on_first_rank(comm, lambda: read_spectrum(initial.file))
+    except ProductError as error:
+        raise SceneError(f"[initial] path = {quoted(initial.path)}: {error}") from None
 
 
 @contextmanager

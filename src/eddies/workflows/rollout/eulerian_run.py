@@ -42,9 +42,9 @@ RUNAWAY_ENERGY = 100.0
 class EulerianRun:
     """A fluid on a coarse grid, with or without a closure, that starts at a frame of the truth.
 
-    It starts from the modes of the unfiltered velocity that the grid holds: of the true flow, or those that particles
-    tell. Equations for the filtered velocity start from these modes after the filter. The particles follow the filtered
-    velocity in both cases.
+    It starts from the modes of the unfiltered velocity that the grid holds: of the true flow, or those found from the
+    velocities of the particles. Equations for the filtered velocity start from these modes after the filter. The
+    particles follow the filtered velocity in both cases.
     """
 
     def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:

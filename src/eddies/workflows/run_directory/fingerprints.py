@@ -13,14 +13,15 @@ from typing import Any
 from eddies.import_path import origins
 from eddies.pipeline import STAGES
 from eddies.scene.scene import FOREIGN_IN, Scene
+from eddies.scene.sections import OF_A_SET
 
 
 # The keys of a stage that only say how long it goes on. One that differs in these alone can be continued.
-DURATIONS = {"dns": ("tracers.turnovers", "time.duration")}
+DURATION_KEYS = {"dns": ("tracers.turnovers", "time.duration")}
 
 
 def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> str:
-    """Return the SHA-256 of the inputs of a stage's product, `without` some keys, such as the stage's DURATIONS.
+    """Return the SHA-256 of the inputs of a stage's product, `without` some keys, such as the stage's DURATION_KEYS.
 
     It covers the settings of the stage and of the scene's earlier stages, the content of the files that the flow, the
     weights and the step come from, the source of the user's classes, and the fingerprints of other ground truths.
@@ -32,6 +33,10 @@ def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> 
         "truths": _fingerprints(training.truth_files if training else ()),
         "found_step": _digest(simulation.step_file if simulation else None),
         "confirming": _fingerprints(simulation.confirming_files if simulation else ())}
+    if scene.tracers is not None and scene.tracers.sets:  # each has its own values, and all share the others
+        sets = settings["tracers"].pop("sets")
+        settings["tracers"] = {key: value for key, value in settings["tracers"].items() if key not in OF_A_SET} | {
+            "sets": {name: {key: sets[name][key] for key in OF_A_SET} for name in sorted(sets)}}
     # The content of these files counts, not their paths.
     if settings["start"] is not None:
         del settings["initial"]["path"]

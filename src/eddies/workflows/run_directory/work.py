@@ -18,13 +18,13 @@ from eddies.io.checkpoint import checkpoints_in
 from eddies.io.checksums import open_to_read
 from eddies.io.errors import ProductError, unreadable
 from eddies.io.hdf5 import open_product, read_attributes, read_table
-from eddies.io.provenance import product_fingerprint, product_provenance
+from eddies.io.provenance import product_provenance
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Scene, Simulation
 from eddies.scene.sections import CONVERGED
-from eddies.workflows.run_directory.fingerprints import DURATIONS, set_files, stage_fingerprint
+from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, set_files, stage_fingerprint
 
 SECONDS = "stage_seconds.json"
 FAILURE = "failure.txt"  # the error of a failed variant
@@ -65,24 +65,28 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
     for stage in [STAGES[name] for name in stages if STAGES[name].product is not None]:
         product, settings = directory / stage.file, stage_fingerprint(scene, stage.name)
         checkpoints = checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
-        continued = stage_fingerprint(scene, stage.name, DURATIONS.get(stage.name, ()))
+        continued = stage_fingerprint(scene, stage.name, DURATION_KEYS.get(stage.name, ()))
         of_others = checkpoints and continued not in [fingerprint for _, fingerprint in checkpoints]
         origin = product_provenance(product)
-        sets = set_files(scene) if stage.name == "dns" else {}
-        if origin.get("fingerprint") == settings and all(
-                product_fingerprint(directory / path) == mark for path, mark in sets.items()):
+        complete, sets = origin.get("fingerprint") == settings, set_files(scene) if stage.name == "dns" else {}
+        of_sets = {path: product_provenance(directory / path) for path in sets}
+        if complete and all(of_sets[path].get("fingerprint") == mark for path, mark in sets.items()):
             done.add(stage.name)
             # Other settings may still be continued, and so may a direct simulation, for longer.
             if not of_others and stage.name != "dns":
                 useless.add(stage.name)
             continue
+        for path, mark in sets.items():
+            if of_sets[path].get("fingerprint") != mark and (directory / path).is_file():
+                lost.append(f"{path}{_cost(of_sets[path], None)}")
+                changes |= dict.fromkeys(changed_settings(stage, of_sets[path].get("scene"), scene.to_toml()))
         same_course = checkpoints and not of_others and origin.get("course") == continued and stage.name not in links
         if same_course and origin["duration"] > scene.duration:
             useless.add(stage.name)  # the checkpoint is too late
         elif same_course:
             begun.add(stage.name)
             continue
-        if product.is_file() and not product.is_symlink():
+        if product.is_file() and not product.is_symlink() and not complete:
             if not origin:
                 _check_readable(product)
             lost.append(stage.file + _cost(origin, seconds.get(stage.name)))
