@@ -3,7 +3,7 @@
 A scene without variants and realisations has one step, in the run directory. Otherwise the run directory holds
 
     ground_truth.h5, kernel.h5            of the scene, made once
-    SET/ground_truth.h5                   of a set of tracers, made together with the first
+    SET/                                  the same for a set of tracers; one simulation makes all ground truths
     realisation-SEED/                     the same for further ground truths, which no training sees
     VARIANT/                              model and rollout of a variant
     VARIANT/realisation-SEED/             its rollouts, one for each realisation
