@@ -223,13 +223,13 @@ def check_inputs(step: Step, comm: Comm, made: Collection[Path] = ()) -> None:
                              "--set options of that run")
 
 
-def prepare_directory(scene: str, comm: Comm, directory: Path) -> None:
+def prepare_directory(text: str, comm: Comm, directory: Path) -> None:
     """Write the text of the scene into a run directory and remove unfinished files of killed jobs; collective."""
     def write() -> None:
         for leftover in directory.glob("*.partial"):
             leftover.unlink()
         (directory / FAILURE).unlink(missing_ok=True)
-        write_files({directory / "scene.toml": scene})
+        write_files({directory / "scene.toml": text})
 
     in_files(comm, directory, write)
 

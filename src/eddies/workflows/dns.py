@@ -139,10 +139,10 @@ def is_made(path: Path, fingerprint: str) -> bool:
     return product_provenance(path).get("fingerprint") == fingerprint
 
 
-def prepare_set(directory: Path, scene: str) -> None:
+def prepare_set(directory: Path, text: str) -> None:
     """Write the text of the scene of a set of tracers, unless another scene works in its directory."""
     if not (directory / "scene.toml").exists():
-        write_files({directory / "scene.toml": scene})
+        write_files({directory / "scene.toml": text})
 
 
 def write_tracers(file: File, tracers: TracerRun, name: str, parts: FrameSegments, forcing: Forcing | None) -> None:

@@ -128,10 +128,10 @@ def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
         yield f"  {title:{width}}  {'' if seconds is None else duration(seconds):>12}  {state}".rstrip()
 
 
-def stage_state(stage: Stage, directory: Path, settings: str, continued: str, scene: str) -> str:
+def stage_state(stage: Stage, directory: Path, settings: str, continued: str, text: str) -> str:
     """The state of a stage in a directory in words.
 
-    `settings` and `continued` are the fingerprints of the stage and of what it can continue, `scene` the scene's text.
+    `settings` and `continued` are fingerprints of the stage and of what it can continue, `text` is that of the scene.
     """
     product = directory / stage.file
     origin = product_provenance(product)
@@ -147,5 +147,5 @@ def stage_state(stage: Stage, directory: Path, settings: str, continued: str, sc
     if product.is_file():
         if not origin:
             return "damaged, unfinished or of another version"
-        return "made with " + of_other_settings(changed_settings(stage, origin.get("scene"), scene))
+        return "made with " + of_other_settings(changed_settings(stage, origin.get("scene"), text))
     return "to do"
