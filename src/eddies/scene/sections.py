@@ -82,8 +82,8 @@ INITIAL_FLOWS = {
     "abc": InitialFlow(("amplitude", "wavenumber"), rms=math.sqrt(3), peak=3 * math.sqrt(2)),
     "shear-wave": InitialFlow(("amplitude", "wavenumber"), rms=math.sqrt(0.5), peak=1.0, steady=True),
     "sound-wave": InitialFlow(("amplitude", "wavenumber"), sound=True),
-    "spectrum": InitialFlow(("path",)),
     "file": InitialFlow(("path", "state")),
+    "spectrum": InitialFlow(("path",)),
 }
 
 
