@@ -232,11 +232,11 @@ def a_simulation(directory, *before):
     line = [*before, sys.executable, "-u", "-m", "eddies", "dns", "hit-small", "--output", directory]
     # A shell's background job ignores the interrupt, and its children inherit that.
     job = subprocess.Popen(list(map(str, line)), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-                           stderr=subprocess.PIPE, text=True, start_new_session=True,
+                           stderr=subprocess.PIPE, text=True, start_new_session=True, env=dict(os.environ),
                            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
     try:
-        while "dns: starts" not in job.stdout.readline():
-            pass
+        while "dns: starts" not in (line := job.stdout.readline()):
+            assert line, f"the job ended: {job.stderr.read()}"
         yield job
     finally:
         if job.poll() is None:
