@@ -25,8 +25,8 @@ def velocity_of_spectrum(grid: SpectralGrid, seed: int, wavenumber: np.ndarray, 
     """
     velocity, present = _gaussian_solenoidal(grid, seed)
     given = energy > 0
-    k = np.maximum(np.arange(len(present)), 1e-9)
-    target = np.exp(np.interp(np.log(k), np.log(wavenumber[given]), np.log(energy[given]), left=-np.inf, right=-np.inf))
+    target, k = np.zeros(len(present)), np.arange(1, len(present))
+    target[1:] = np.exp(np.interp(np.log(k), np.log(wavenumber[given]), np.log(energy[given]), -np.inf, -np.inf))
     return _with_spectrum(grid, velocity, present, target)
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -43,23 +42,15 @@ class FrameLayout:
     dtype: type[np.floating]  # of the trajectories
     fields: Mapping[str, FieldLayout]  # by name
 
-    def writers(self, file: File, names: Mapping[str, str] | None = None
+    def writers(self, file: File, names: Mapping[str, str], images: bool = False
                 ) -> tuple[dict[str, TrajectoryWriter], dict[str, FieldWriter]]:
-        """Writers of the trajectories and of the fields, by name; collective.
-
-        A product has the series of `names`, under the names there, and trajectories with positions have images. Without
-        `names` it is a segment with all series.
-        """
-        def stored(series: Mapping[str, Any]) -> Iterator[tuple[str, str, Any]]:
-            for name, layout in series.items():
-                if names is None or name in names:
-                    yield name, name if names is None else names[name], layout
-
-        return ({name: TrajectoryWriter(file, group, layout.total, self.length, layout.columns, self.dtype,
-                                        names is not None and "position" in layout.columns)
-                 for name, group, layout in stored(self.trajectories)},
-                {name: FieldWriter(file, group, layout.cells, layout.variables)
-                 for name, group, layout in stored(self.fields)})
+        """Writers of the trajectories and of the fields in `names`, under the names there; collective. `images` adds
+        the column of images to trajectories with positions."""
+        return ({name: TrajectoryWriter(file, names[name], series.total, self.length, series.columns, self.dtype,
+                                        images and "position" in series.columns)
+                 for name, series in self.trajectories.items() if name in names},
+                {name: FieldWriter(file, names[name], series.cells, series.variables)
+                 for name, series in self.fields.items() if name in names})
 
     @property
     def names(self) -> dict[str, str]:
@@ -85,7 +76,7 @@ class FrameSegments:
         in_files(self.comm, self.directory, lambda: self.directory.mkdir(exist_ok=True))
         self._name = f"frames-{step:08d}.h5"
         file = self._file.enter_context(create_product(self.comm, self.directory / self._name, "frames", {}))
-        self.trajectories, self.fields = self.layout.writers(file)
+        self.trajectories, self.fields = self.layout.writers(file, self.layout.names)
 
     def close(self) -> None:
         """Close the open segment, if any."""
@@ -107,7 +98,7 @@ class FrameSegments:
         """Copy the frames of all segments into a product, which also counts the images: of all series, or of those of
         `names` under the names there."""
         self.close()
-        trajectories, fields = self.layout.writers(file, self.layout.names if names is None else names)
+        trajectories, fields = self.layout.writers(file, self.layout.names if names is None else names, images=True)
         slabs = {name: SlabDecomposition(self.comm, self.layout.length, series.cells)
                  for name, series in self.layout.fields.items()}
         starts = {name: id_block(self.comm, series.total)[0] for name, series in self.layout.trajectories.items()}

@@ -19,7 +19,7 @@ from eddies.io.frame_segments import FrameSegments
 from eddies.io.hdf5 import (File, ProductError, create_product, in_files, open_product, write_attributes,
                             write_table)
 from eddies.io.new_files import write_files
-from eddies.io.provenance import product_provenance
+from eddies.io.provenance import product_fingerprint, product_provenance
 from eddies.io.run_lock import lock_directory
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_first_rank
@@ -99,8 +99,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 final = flow.state_dict()
                 last = flow.history.sample(flow.state, flow.clock)
                 for name, own in sets.items():
-                    path, mark = directory / name / product.name, stage_fingerprint(own, "dns")
-                    if in_files(comm, path, partial(is_made, path, mark)):
+                    path = directory / name / product.name
+                    if in_files(comm, path, partial(product_fingerprint, path)) == stage_fingerprint(own, "dns"):
                         continue  # what was made from it stays valid
                     in_files(comm, path, partial(prepare_set, path.parent, own.to_toml()))
                     with create_product(comm, path, "ground_truth", stage_provenance(own, "dns")) as part:
@@ -132,11 +132,6 @@ def holding(comm: Comm, directories: Sequence[Path]) -> Iterator[None]:
         for directory in directories:
             locks.enter_context(lock_directory(comm, directory))
         yield
-
-
-def is_made(path: Path, fingerprint: str) -> bool:
-    """Whether a ground truth has been made with these settings."""
-    return product_provenance(path).get("fingerprint") == fingerprint
 
 
 def prepare_set(directory: Path, text: str) -> None:

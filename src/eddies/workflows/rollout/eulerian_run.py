@@ -220,12 +220,10 @@ def state_of_particles(truth: GroundTruth, fluid: Fluid, filter_passed: float, f
 
     Modes beyond those that the particles resolve are zero.
     """
-    grid, scales = fluid.grid, truth.scales
-    units = FlowUnits(scales, cutoff=0.0, neighbors=0.0)  # no pairs
+    grid, units = fluid.grid, FlowUnits(truth.scales, cutoff=0.0, neighbors=0.0)  # no pairs
     resolved = ResolvedVelocity.on_slabs(truth.decomposition, units).of(ParticleSet.from_numpy(truth.particles(frame)))
-    known = resolved.grid.spectral
-    modes = as_numpy(resolved.velocity if filter_passed else resolved.unfiltered)
-    velocity = grid.solenoidal(regrid(known, grid, modes).astype(grid.complex))
+    modes = resolved.velocity if filter_passed else resolved.unfiltered
+    velocity = regrid(resolved.grid.spectral, grid, as_numpy(modes))
     if not fluid.compressible:
         return velocity
     return np.concatenate([velocity, balanced_density(grid, velocity, fluid.sound_speed)[None]])

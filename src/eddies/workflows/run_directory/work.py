@@ -65,7 +65,8 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
     for stage in [STAGES[name] for name in stages if STAGES[name].product is not None]:
         product, settings = directory / stage.file, stage_fingerprint(scene, stage.name)
         checkpoints = checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
-        continued = stage_fingerprint(scene, stage.name, DURATION_KEYS.get(stage.name, ()))
+        keys = DURATION_KEYS.get(stage.name)
+        continued = stage_fingerprint(scene, stage.name, keys) if keys else settings
         of_others = checkpoints and continued not in [fingerprint for _, fingerprint in checkpoints]
         origin = product_provenance(product)
         complete, sets = origin.get("fingerprint") == settings, set_files(scene) if stage.name == "dns" else {}
