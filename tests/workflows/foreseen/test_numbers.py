@@ -15,6 +15,7 @@ from eddies.workflows.foreseen.seconds import START, seconds
 from eddies.workflows.foreseen.storage import (FLOW_PROCESS, TORCH_PROCESS, Disk, disk, flow_memory, memory, most_disk,
                                                rollout_bytes, trajectory_bytes)
 from eddies.workflows.ground_truth.frame_counts import whole_frames
+from eddies.workflows.problems import _large_files
 from tests.small_scene import one_model
 
 SCENE = """
@@ -156,6 +157,12 @@ def test_the_disk_of_the_worst_moment():
     assert most_disk([Disk(4.0, 2.0), Disk(None, 9.0), Disk(3.0)]) == 13 and most_disk([Disk(2.0)] * 3) == 6
     kept, scratch, beside = disk(load_scene("taylor-green", ["flow.cells=256"]), "dns")
     assert kept - beside > 4 * 3 * 256**3 and scratch >= beside > 256**3
+
+
+def test_the_last_state_is_no_part_of_the_largest_product():
+    """A limit of 4 GB a file, where rank 0 writes for all."""
+    sizes = {"all in the product": Disk(5e9), "a state beside it": Disk(5e9, beside=2e9)}
+    assert [name for name, needed in sizes.items() if [*_large_files({"dns": needed}, 2)]] == ["all in the product"]
 
 
 @pytest.mark.parametrize("stage, override", [
