@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from eddies.measures import DRAWN, MEASURES, SHOWN
 from eddies.report.figures import png
 from eddies.report.variants import ErrorAgainstTime, name_points, scatter, section
-from eddies.workflows.variant_rows import BEFORE
+from eddies.workflows.variant_rows import BEFORE, BREAK_EVEN
 
 
 def row(name, seconds, error, status="complete", stopped_at=None, kind="particle model"):
@@ -16,7 +16,8 @@ def row(name, seconds, error, status="complete", stopped_at=None, kind="particle
             "status": status, "stopped_at": stopped_at, "end": 1.0,
             "wall_seconds": seconds, "wall_seconds_low": seconds and 0.9 * seconds,
             "wall_seconds_high": seconds and 1.2 * seconds, "core_seconds": seconds,
-            "seconds_per_step": 0.1, "time_step": 0.02, **dict.fromkeys(BEFORE), **dict.fromkeys(MEASURES, error)}
+            "seconds_per_step": 0.1, "time_step": 0.02,
+            **dict.fromkeys([*BEFORE, *BREAK_EVEN]), **dict.fromkeys(MEASURES, error)}
 
 
 ROWS = [row("learned", 20.0, 0.1), row("none", 1.0, 0.5), row("slow", 90.0, 0.2),

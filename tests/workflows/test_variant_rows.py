@@ -4,12 +4,13 @@
 import numpy as np
 import pytest
 
+from eddies.analysis.pareto import break_even
 from eddies.io.hdf5 import create_product, write_attributes, write_table
 from eddies.io.weights import save_weights
 from eddies.measures import MEASURES
 from eddies.scene.scene import load_scene
-from eddies.workflows.variant_rows import (BEFORE, SEARCH, THROUGH_KERNEL, before, notes, row, step_costs, together,
-                                           why_not)
+from eddies.workflows.variant_rows import (BEFORE, BREAK_EVEN, SEARCH, THROUGH_KERNEL, add_break_even, before, notes,
+                                           row, step_costs, together, why_not)
 from eddies.workflows.variants import Place
 from tests.small_scene import TINY
 
@@ -102,3 +103,21 @@ def test_the_cost_of_a_model_is_read_from_its_file(comm, tmp_path, stored):
     assert found == {key: known[key] for key in stored} | search and set(found) <= set(BEFORE)
     for missing in (None, tmp_path / "missing.h5"):
         assert before(missing, missing, comm) == {}
+
+
+def test_a_method_breaks_even_with_the_simulation_and_with_the_cheapest_grid_as_accurate():
+    def made(name, seconds, error, training, on_grid=False, **more):
+        return dict.fromkeys(BREAK_EVEN) | {
+            "name": name, "status": "complete", "on_grid": on_grid, "wall_seconds": seconds, "step_seconds": 2.0,
+            "velocity_error_half": error, "velocity_error_end": None, "training_seconds": training} | more
+
+    fast, slow = made("fast", 1.0, 0.1, 18.0), made("slow", 9.0, 0.02, 18.0)
+    rows = [fast, slow, made("coarse", 0.5, 0.2, None, True), made("fine", 3.0, 0.05, None, True),
+            made("finer", 4.0, 0.01, None, True), made("broken", 1.0, 0.001, 5.0, status="stopped")]
+    add_break_even(rows, 6.0)
+    # 20 s before the first turnover; a turnover saves 5 s of the simulation's 6, and 2 s of the grid's 3, whose search
+    # took 2 s.
+    assert [fast[key] for key in BREAK_EVEN] == pytest.approx([4.0, 9.0])
+    assert [slow[key] for key in BREAK_EVEN] == ["never", "never"]
+    assert all(row[key] is None for row in rows[2:] for key in BREAK_EVEN)
+    assert break_even(1.0, 1.0, 5.0, 2.0) == 0

@@ -1,5 +1,6 @@
 """Error against cost: the Pareto front, and sentences that say where a model is worth its cost."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -70,6 +71,16 @@ def cheapest_grid(model: Method, grids: Sequence[Method], cost: str, times: Mapp
         return f"No grid {limit}."
     best = min(kept, key=lambda row: row[cost])
     return f"The cheapest grid that {limit} is {best['label']}, at {best[cost] / model[cost]:.2g} of the cost."
+
+
+def break_even(first: float, each: float, rival_first: float, rival_each: float) -> float:
+    """Turnovers after which a method has taken less time than a rival; infinite if it never has.
+
+    `first` are seconds before the first turnover, `each` those of a turnover.
+    """
+    if each >= rival_each:
+        return math.inf
+    return max(0.0, (first - rival_first) / (rival_each - each))
 
 
 def _worse(row: Method, model: Method, key: str) -> bool:

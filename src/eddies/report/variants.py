@@ -30,7 +30,9 @@ COSTS = {"end": "time of the end (T)", "stopped_at": "unstable at (T)",
          "wall_seconds": "wall s per T", "wall_seconds_low": "lower quartile", "wall_seconds_high": "upper quartile",
          "core_seconds": "core s per T", "seconds_per_step": "s per step", "time_step": "time step",
          "ranks": "ranks", "weights": "learned numbers", "training_seconds": "training (s)",
-         "training_steps": "training (steps)", "step_seconds": "finding the step (s)"}
+         "training_steps": "training (steps)", "step_seconds": "finding the step (s)",
+         "break_even_simulation": "cheaper than the direct simulation after (T)",
+         "break_even_grid": "cheaper than the cheapest grid as accurate at T/2 after (T)"}
 LEGEND = ("Wall seconds per turnover T, with the quartiles of the time of a step as bars. Bars of errors are standard "
           "deviations over realisations, if there are several. Dashed line: Pareto front, the variants that no other "
           "one beats in both error and time. Crosses at the top: variants that became unstable, at the time given.")

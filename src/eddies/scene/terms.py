@@ -254,6 +254,7 @@ class WCSPH(TermSettings):
 
     word = "wcsph"
 
+    speed: float = number("sound speed of the pressure over that of the flow, at first", default=1.0, above=0)
     alpha: float = number("linear coefficient of the artificial viscosity", default=1.0, at_least=0)
     beta: float = number("quadratic coefficient of the artificial viscosity", default=2.0, at_least=0)
     exponent: float = number("gamma of the pressure c^2 rho_0 / gamma ((rho / rho_0)^gamma - 1)", default=1.0,
@@ -264,10 +265,10 @@ class WCSPH(TermSettings):
                 'one; lower step, and use integrator = "verlet"')
 
     def longest_step(self, units: StepUnits) -> float:
-        """0.4 h / (c (1 + 0.6 alpha)) (Monaghan 1992), h half the kernel's support."""
+        """0.4 h / (c (1 + 0.6 alpha)) (Monaghan 1992), h half the kernel's support, c that of the pressure."""
         if units.sound_speed is None:
             return math.inf
-        return 0.4 * units.radius / 2 / (units.sound_speed * (1 + 0.6 * self.alpha))
+        return 0.4 * units.radius / 2 / (self.speed * units.sound_speed * (1 + 0.6 * self.alpha))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -40,7 +40,7 @@ from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.workflows.problems import place_problems
 from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite
 from eddies.workflows.run_directory.work import read_stage_seconds
-from eddies.workflows.variant_rows import COLUMNS, ROLLOUT, machine, notes, numbers, row
+from eddies.workflows.variant_rows import COLUMNS, ROLLOUT, add_break_even, machine, notes, numbers, row
 from eddies.workflows.variants import Place, rollouts
 
 if TYPE_CHECKING:
@@ -53,6 +53,7 @@ KINDS = "ground_truth", "kernel", "model", "step", "rollout"  # products, in the
 ROLLOUT_COST = {"seconds_per_step": "rollout: seconds of a step (median, without storing)",
                 "particles": "particles of the rollout",
                 "ranks": "ranks of the rollout"}
+SIMULATION = "dns_seconds_per_turnover"
 MAIN_PAGE = 3  # the main page takes as long as this many other pages; so does a round of pages
 Row = dict[str, Any]
 
@@ -74,6 +75,11 @@ class Page:
     stationary: StationarySpan | None = None
     sections: list[Section] = field(default_factory=list)
     images: dict[str, bytes] = field(default_factory=dict)
+
+    @property
+    def simulation_seconds(self) -> float | None:
+        """Wall seconds of a turnover of the direct simulation; None without a ground truth."""
+        return next((metric.value for metric in self.cost if metric.key == SIMULATION), None)
 
     def draw(self, sections: Sequence[Section]) -> None:
         """Draw the figures of sections and free them. A figure that fails is left out with a warning."""
@@ -176,7 +182,8 @@ def sections_of(directory: Path, alone: Comm) -> list[Section]:
     stored = Run.of(directory)
     stored = replace(stored, pages={stored.main: stored.pages[stored.main]})
     made, rows = _make(stored, alone, alone, StopRequest(alone), draw=False)
-    return [*_table_section(stored, rows)[0], *made[stored.main].sections]
+    page = made[stored.main]
+    return [*_table_section(stored, page, rows)[0], *page.sections]
 
 
 def _make(stored: Run, comm: Comm, alone: Comm, stop: StopRequest,
@@ -353,8 +360,11 @@ def _rollout_sections(measured: Rollout, page: Page, main: bool) -> list[Section
 def _cost(file: File, kind: str) -> list[Metric]:
     """Return the cost of the steps that made a product."""
     if kind == "ground_truth":
-        seconds = float(np.median(read_table(file, "statistics")["seconds_per_step"]))
-        return [Metric("dns_seconds_per_step", "DNS: seconds of a step (median, without storing)", seconds)]
+        statistics, turnover = read_table(file, "statistics"), file["reference"].attrs["eddy_turnover_time"]
+        seconds = float(np.median(statistics["seconds_per_step"]))
+        steps = turnover / float(np.median(statistics["time_step"]))
+        return [Metric("dns_seconds_per_step", "DNS: seconds of a step (median, without storing)", seconds),
+                Metric(SIMULATION, "DNS: wall seconds of a turnover (median step)", steps * seconds)]
     if kind != "rollout":
         return []
     attributes = read_attributes(file, "rollout")
@@ -377,19 +387,21 @@ def _cost_section(page: Page) -> Section:
                    main=("seconds_per_step",))
 
 
-def _table_section(stored: Run, rows: Mapping[str, Row]
+def _table_section(stored: Run, page: Page, rows: Mapping[str, Row]
                    ) -> tuple[list[Section], table_of_variants.ErrorAgainstTime | None]:
     """Return the section on all variants with its table; nothing if no variant was run."""
     if not stored.main:
         return [], None
-    table = table_of_variants.ErrorAgainstTime([rows[name] for name in stored.places], stored.main)
+    of_variants = [rows[name] for name in stored.places]
+    add_break_even(of_variants, page.simulation_seconds)
+    table = table_of_variants.ErrorAgainstTime(of_variants, stored.main)
     return [table_of_variants.section(table, notes(stored.scene))], table
 
 
 def _write_main(stored: Run, page: Page, rows: Mapping[str, Row], comm: Comm) -> None:
     """Write the main page, with the table of variants if there is one, and log its numbers; one rank calls it."""
     output, scene, beside = stored.report_of(stored.directory), stored.scene, {}
-    first, table = _table_section(stored, rows)
+    first, table = _table_section(stored, page, rows)
     page.draw(first)
     page.sections = [*first, *page.sections]
     if table is not None:
@@ -400,7 +412,7 @@ def _write_main(stored: Run, page: Page, rows: Mapping[str, Row], comm: Comm) ->
         reference = product_attributes(page.directory / "ground_truth.h5", "reference")
         flow = {key: finite(float(value)) for key, value in reference.items() if isinstance(value, (float, np.number))}
         record = {"name": scene.name, "title": scene.title, "machine": machine(scene.device, comm.size), "flow": flow,
-                  "rows": table.rows, "summary": table.summary}
+                  "simulation_seconds": page.simulation_seconds, "rows": table.rows, "summary": table.summary}
         beside = {output / "variants.csv": lines.getvalue(),
                   output / "variants.json": json.dumps(record, indent=2, allow_nan=False) + "\n"}
     page.seconds = {**read_stage_seconds(stored.directory), **page.seconds}

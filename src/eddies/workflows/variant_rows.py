@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 from collections.abc import Mapping, Sequence
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eddies.analysis.accuracy import accuracy
+from eddies.analysis.pareto import break_even
 from eddies.cores import threads
 from eddies.io.hdf5 import open_product
 from eddies.io.provenance import environment, read_json
@@ -33,8 +35,11 @@ COST = ("seconds_per_step", "time_step", "wall_seconds", "wall_seconds_low", "wa
 SEARCH = ("step_integrator", "step_size", "step_seconds", "step_error", "step_error_half", "step_error_twice")
 BEFORE = ("weights", "training_seconds", "training_steps", *SEARCH)  # cost before the rollout
 THROUGH_KERNEL = ("qr_kl", "qr_kl_floor")  # measured on gradients that the smoothing kernel reconstructs
+# Turnovers after which training, search and rollout have taken less time than the direct simulation, and than the
+# cheapest grid with at most the velocity error: a number, or "never".
+BREAK_EVEN = ("break_even_simulation", "break_even_grid")
 COLUMNS = ("name", "label", "method", "kind", "on_grid", "status", "stopped_at", "realisations", *MEASURES, "end",
-           *COST, *BEFORE, *(f"{measure}_spread" for measure in MEASURES), "settings")
+           *COST, *BEFORE, *BREAK_EVEN, *(f"{measure}_spread" for measure in MEASURES), "settings")
 MODEL, ROLLOUT = STAGES["train"].file, STAGES["simulate"].file
 # Numbers of THROUGH_KERNEL cannot be compared between scenes whose kernels differ.
 _kernel_of = partial(stage_fingerprint, stage="train-kernel")
@@ -91,6 +96,29 @@ def together(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         choose = {"wall_seconds_low": min, "wall_seconds_high": max}.get(key, np.median)
         found[key] = float(choose(values)) if values else None
     return found
+
+
+def add_break_even(rows: Sequence[dict[str, Any]], simulation: float | None) -> None:
+    """Add the numbers of BREAK_EVEN to the rows of trained methods.
+
+    The errors are those at T/2, or at the end of shorter rollouts; means over realisations are compared. `simulation`
+    are the wall seconds of a turnover of the direct simulation, None if unknown. A grid counts with its search.
+    """
+    known = [row for row in rows if row["status"] == "complete" and row["wall_seconds"] is not None]
+    measure = "velocity_error_half" if any(row["velocity_error_half"] is not None for row in known) else (
+        "velocity_error_end")
+    for row in known:
+        if row["training_seconds"] is None or row[measure] is None:
+            continue
+        method = row["training_seconds"] + (row["step_seconds"] or 0.0), row["wall_seconds"]
+        grids = [grid for grid in known if grid["on_grid"] and grid is not row and grid[measure] is not None
+                 and grid[measure] <= row[measure]]
+        rivals = {"break_even_simulation": [] if simulation is None else [(0.0, simulation)],
+                  "break_even_grid": [(grid["step_seconds"] or 0.0, grid["wall_seconds"]) for grid in grids]}
+        for key, costs in rivals.items():
+            if costs:
+                turnovers = break_even(*method, *min(costs, key=lambda cost: cost[1]))
+                row[key] = turnovers if math.isfinite(turnovers) else "never"
 
 
 def before(model: Path | None, step: Path | None, alone: Comm) -> dict[str, Any]:

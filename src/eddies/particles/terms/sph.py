@@ -111,7 +111,7 @@ class WCSPH(_SPHTerm):
     def __init__(self, settings: declared.WCSPH, flow: FlowUnits) -> None:
         super().__init__(settings, flow)
         self.sound_speed, self.alpha, self.beta = (nn.Parameter(torch.tensor(value, dtype=torch.float64))
-                                                   for value in (1.0, settings.alpha, settings.beta))
+                                                   for value in (settings.speed, settings.alpha, settings.beta))
 
     @property
     def learned_coefficients(self) -> list[Coefficient]:
