@@ -10,7 +10,7 @@ from eddies.io.weights import save_weights
 from eddies.measures import MEASURES
 from eddies.scene.scene import load_scene
 from eddies.workflows.variant_rows import (BEFORE, BREAK_EVEN, SEARCH, THROUGH_KERNEL, add_break_even, before, notes,
-                                           row, step_costs, together, why_not)
+                                           row, simulation_seconds, step_costs, together, why_not)
 from eddies.workflows.variants import Place
 from tests.small_scene import TINY
 
@@ -103,6 +103,15 @@ def test_the_cost_of_a_model_is_read_from_its_file(comm, tmp_path, stored):
     assert found == {key: known[key] for key in stored} | search and set(found) <= set(BEFORE)
     for missing in (None, tmp_path / "missing.h5"):
         assert before(missing, missing, comm) == {}
+
+
+def test_the_direct_simulation_is_timed_with_the_others_where_a_variant_repeats_it(tmp_path):
+    grid = 'simulation.method = "eulerian"'
+    scene = scene_of(tmp_path, ("grid", grid), ("dns", grid, "eulerian.cells = 24"))
+    assert scene.variant["dns"].flow.cells == 24
+    rows = [{"name": name, "wall_seconds": seconds} for name, seconds in (("plain", 1.0), ("grid", 2.0), ("dns", 5.0))]
+    assert simulation_seconds(scene, rows, 9.0) == 5.0
+    assert simulation_seconds(scene, rows[:2], 9.0) == 9.0
 
 
 def test_a_method_breaks_even_with_the_simulation_and_with_the_cheapest_grid_as_accurate():

@@ -40,7 +40,8 @@ from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.workflows.problems import place_problems
 from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite
 from eddies.workflows.run_directory.work import read_stage_seconds
-from eddies.workflows.variant_rows import COLUMNS, ROLLOUT, add_break_even, machine, notes, numbers, row
+from eddies.workflows.variant_rows import (COLUMNS, ROLLOUT, add_break_even, machine, notes, numbers, row,
+                                           simulation_seconds)
 from eddies.workflows.variants import Place, rollouts
 
 if TYPE_CHECKING:
@@ -393,8 +394,9 @@ def _table_section(stored: Run, page: Page, rows: Mapping[str, Row]
     if not stored.main:
         return [], None
     of_variants = [rows[name] for name in stored.places]
-    add_break_even(of_variants, page.simulation_seconds)
-    table = table_of_variants.ErrorAgainstTime(of_variants, stored.main)
+    simulation = simulation_seconds(stored.scene, of_variants, page.simulation_seconds)
+    add_break_even(of_variants, simulation)
+    table = table_of_variants.ErrorAgainstTime(of_variants, stored.main, simulation)
     return [table_of_variants.section(table, notes(stored.scene))], table
 
 
@@ -412,7 +414,7 @@ def _write_main(stored: Run, page: Page, rows: Mapping[str, Row], comm: Comm) ->
         reference = product_attributes(page.directory / "ground_truth.h5", "reference")
         flow = {key: finite(float(value)) for key, value in reference.items() if isinstance(value, (float, np.number))}
         record = {"name": scene.name, "title": scene.title, "machine": machine(scene.device, comm.size), "flow": flow,
-                  "simulation_seconds": page.simulation_seconds, "rows": table.rows, "summary": table.summary}
+                  "simulation_seconds": table.simulation_seconds, "rows": table.rows, "summary": table.summary}
         beside = {output / "variants.csv": lines.getvalue(),
                   output / "variants.json": json.dumps(record, indent=2, allow_nan=False) + "\n"}
     page.seconds = {**read_stage_seconds(stored.directory), **page.seconds}

@@ -98,6 +98,14 @@ def together(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return found
 
 
+def simulation_seconds(scene: Scene, rows: Sequence[Mapping[str, Any]], of_truth: float | None) -> float | None:
+    """Return the wall seconds of a turnover of the direct simulation: of the variant that repeats it, if there is one,
+    which is timed with the others, and of the ground truth otherwise."""
+    repeated = [row["wall_seconds"] for row in rows if row["wall_seconds"] is not None
+                and (variant := scene.variant.get(row["name"], scene)).coarse_cells == variant.flow.cells]
+    return min(repeated, default=of_truth)
+
+
 def add_break_even(rows: Sequence[dict[str, Any]], simulation: float | None) -> None:
     """Add the numbers of BREAK_EVEN to the rows of trained methods.
 
