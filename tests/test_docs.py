@@ -13,6 +13,9 @@ import pytest
 
 from eddies.cli import main
 from eddies.cli_options import build_parser
+from eddies.particles.flow_units import BEYOND_DISSIPATION, BEYOND_NYQUIST, LEAST_TRANSFER
+from eddies.particles.resolved_velocity import TOLERANCE, TOLERANCE_PREDICTED, WEIGHT
+from eddies.scene.integrators import SCHEMES
 from eddies.scene.model import Model, settings_class
 from eddies.scene.rules import quoted
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError, Tracers, builtin_scenes, load_scene
@@ -249,6 +252,24 @@ def test_every_guarantee_names_tests_that_exist():
         assert named and len(named) == tests.count("`") / 2, guarantee
         for path, name in named:
             assert f"\ndef {name}(" in (CHECKOUT / "tests" / path).read_text(), f"{path}::{name}"
+
+
+def test_constants_of_the_resolved_velocity_are_those_of_the_code():
+    def power(number):
+        return f"{number:.0e}".replace("e-0", "e-")
+
+    angle = {name: f"{scheme.angle:g}" for name, scheme in SCHEMES.items()}
+    assert WEIGHT == 100
+    page = " ".join(text_of(CHECKOUT / "docs/closure.md").split())
+    for words in (f"the lowest of {BEYOND_NYQUIST:g} k_N, {BEYOND_DISSIPATION:g}/η, and the wavenumber at which the "
+                  f"filter leaves {LEAST_TRANSFER:g}", "σ² is 100 times the energy that the prior expects beyond k_c",
+                  f"a residual of {power(TOLERANCE_PREDICTED)} of the velocities' rms; without a forecast at "
+                  f"{power(TOLERANCE)}", f"at most {angle['rk3']} for `rk3` and `rk2`, {angle['rk4']} for `rk4`, and "
+                  f"{angle['verlet']} for `verlet` and `corrected-verlet`"):
+        assert words in page, words
+    assert angle["rk2"] == angle["rk3"] and angle["corrected-verlet"] == angle["verlet"]
+    assert "σ² a hundred times the expected energy beyond k_c" in " ".join(
+        text_of(CHECKOUT / "docs/how-it-works.md").split())
 
 
 def test_formulas_shown_are_those_of_the_library():
