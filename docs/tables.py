@@ -3,7 +3,8 @@
     .venv/bin/python docs/tables.py
 
 A table stands between two comments. The first names the comparison in docs/results, the columns, and the rows with the
-words for them; a row `floor` is the truth's own, and a line `*` takes all rows under their names:
+words for them; a row `floor` is the truth's own, a row `simulation` has the cost of the direct simulation, and a line
+`*` takes all rows under their names:
 
     <!-- table of compare-small: wall_seconds velocity_error_half
     learned: the default
@@ -33,10 +34,12 @@ PAGES = (HERE.parent / "README.md", *sorted(HERE.glob("*.md")), *sorted(HERE.glo
 TABLE = re.compile(r"(<!-- table of ([\w-]+): ([^\n]*)\n(.*?)-->\n).*?(?=<!-- end of table -->)", re.DOTALL)
 NUMBERS = re.compile(r"(<!-- numbers of ([\w-]+)\n(.*?)-->\n).*?(?=<!-- end of numbers -->)", re.DOTALL)
 WORDS = MEASURES | {"wall_seconds": "seconds a turnover", "core_seconds": "core seconds a turnover",
-                    "training_seconds": "training (s)", "time_step": "step",
+                    "training_seconds": "training (s)",
+                    "break_even_simulation": "cheaper than the direct simulation after (T)",
+                    "break_even_grid": "cheaper than the best grid after (T)", "time_step": "step",
                     "step_integrator": "integrator", "step_size": "step", "step_seconds": "search (s)",
                     "step_error_twice": "error with twice the step", "step_error": "error", "step_error_half": "with half"}
-FLOOR = "floor"
+FLOOR, SIMULATION = "floor", "simulation"
 
 
 def written(page: str) -> str:
@@ -52,6 +55,7 @@ def table(comparison: str, columns: str, rows: str) -> str:
     # Any complete row has the floors, which are the truth's.
     results[FLOOR] = {key.removesuffix("_floor"): value for row in record["rows"] for key, value in row.items()
                       if key.endswith("_floor") and value is not None}
+    results[SIMULATION] = {"wall_seconds": record.get("simulation_seconds")}
     lines = ["| |" + "".join(f" {WORDS[key]} |" for key in keys), "|---|" + "---|" * len(keys)]
     asked = [] if rows.strip() == "*" else [row.split(": ", 1) for row in rows.strip().splitlines()]
     for name, words in asked or [(row["name"], f"`{row['name']}`") for row in record["rows"]]:
