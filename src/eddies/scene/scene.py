@@ -82,10 +82,14 @@ class Scene(Section):
         return replace(self.without_variants, kernel=None, model=None, training=None, simulation=None, eulerian=None)
 
     @property
+    def sets(self) -> Mapping[str, Tracers]:
+        """The sets of tracers by name; none with one kind of tracers."""
+        return self.tracers.sets if self.tracers else {}
+
+    @property
     def tracer_sets(self) -> "dict[str, Scene]":
         """The scenes of the ground truths of the sets of tracers, by name of the set."""
-        sets = self.tracers.sets if self.tracers else {}
-        return {name: replace(self.ground_truth_alone, tracers=own) for name, own in sets.items()}
+        return {name: replace(self.ground_truth_alone, tracers=own) for name, own in self.sets.items()}
 
     # ---- values that follow from several sections
 
@@ -95,7 +99,7 @@ class Scene(Section):
 
         Tracers of several sets only have ground truths: a scene must choose a set for the other stages.
         """
-        if self.tracers is not None and self.tracers.sets:
+        if self.sets:
             return "dns", "report"
         learned = self.simulation is None or self.needs_model
         finds = self.simulation is not None and self.simulation.finds_step
@@ -209,9 +213,9 @@ class Scene(Section):
         """Raise SceneError if the section of a stage is missing."""
         for stage in stages:
             if stage not in self.stages:
-                if self.tracers is not None and self.tracers.sets:
+                if self.sets:
                     raise SceneError(f"{self.name}: `eddies {stage}` needs one set of tracers; set [tracers] set to "
-                                     f"one of {', '.join(self.tracers.sets)}")
+                                     f"one of {', '.join(self.sets)}")
                 if stage == "train" and self.model is not None and self.simulation is not None:
                     raise SceneError(f'{self.name}: [simulation] method = "{self.simulation.method}" needs no trained '
                                      'model; set method = "learned" to train one')
@@ -223,7 +227,7 @@ class Scene(Section):
         for name, variant in (self.variant or {self.name: self}).items():
             trained_on = [path.resolve() for path in variant.training.truth_files] if variant.training else []
             for seed in self.realisations or ():
-                for part in ("", *(self.tracers.sets if self.tracers else ())):
+                for part in ("", *self.sets):
                     path = directory / f"{REALISATION}{seed}" / part / STAGES["dns"].file
                     if path.resolve() in trained_on:
                         raise SceneError(f"{name}: [training] truths names {path}, which is a realisation; remove "
@@ -240,17 +244,17 @@ class Scene(Section):
         if tracers is not None:
             yield from checks.check_tracers(tracers, flow, self.initial)
             yield from checks.check_sets(tracers, self.variant)
-        if tracers is not None and not tracers.sets:
+        if tracers is not None and not self.sets:
             yield from checks.check_filtered(tracers, present)
             for name, neighbors in (("kernel", kernel and kernel.neighbors), ("model", model and model.neighbors)):
                 yield from checks.check_reach(name, neighbors or 0.0, tracers, simulation.skin if simulation else 0.0)
         yield from checks.check_needs(present, self.needs_model, model is not None and model.path is not None)
         yield from checks.check_density(flow, model, simulation)
-        if self.training is not None and not (tracers and tracers.sets):
+        if self.training is not None and not self.sets:
             yield from checks.check_training(self.training, tracers, kernel)
         if simulation is not None and tracers is not None:
             yield from checks.check_simulation(simulation, tracers, self.seen_in(self.directory))
-        if not (tracers and tracers.sets):
+        if not self.sets:
             yield from checks.check_coarse_grid(self.eulerian, self.coarse_cells, flow, model)
         for name in self.variant:
             yield from ((f"{VARIANT}.{name}", problem) for problem in self._problems_of_variant(name))
@@ -262,9 +266,9 @@ class Scene(Section):
             yield problem
         elif not isinstance(variant, Scene) or variant.variant or variant.realisations:
             yield "must be a scene without variants and realisations of its own"
-        elif variant.tracers is not None and variant.tracers.sets:
+        elif variant.sets:
             yield (f"needs one set of tracers; set {VARIANT}.{name}.tracers.set, or [tracers] set for all, to one of "
-                   f"{', '.join(variant.tracers.sets)}")
+                   f"{', '.join(variant.sets)}")
         elif variant.simulation is None or self.simulation is None:
             yield "variants are compared by their rollouts; add [simulation] to the scene and to its variants"
         else:

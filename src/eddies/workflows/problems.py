@@ -97,8 +97,8 @@ def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
     if "report" in context.stages:
         refused |= dict.fromkeys(place_problems(("report",), comm, context.directory))
     needed = most_disk(disk(step.scene, stage) for step in planned for stage in step.stages)
-    if scene.tracers is not None and scene.tracers.sets and scene.kernel is not None and not scene.variant:
-        doubts[f"[tracers] set: is absent, so that only the ground truths of {', '.join(scene.tracers.sets)} are made; "
+    if scene.sets and scene.kernel is not None and not scene.variant:
+        doubts[f"[tracers] set: is absent, so that only the ground truths of {', '.join(scene.sets)} are made; "
                "choose one of them for kernel, model and rollout"] = []
     if needed > context.free_disk:
         doubts[f"the stages need about {in_units(needed)} of disk, and {in_units(context.free_disk)} are free here; "

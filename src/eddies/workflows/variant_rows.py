@@ -171,7 +171,7 @@ def notes(scene: Scene) -> list[str]:
 
 def _measure_of(scene: Scene) -> Scene:
     """Return the scene whose kernel measures all variants: that of the whole or, with sets of tracers, of the first."""
-    return next(iter(scene.variant.values())) if scene.tracers.sets else scene.without_variants
+    return next(iter(scene.variant.values())) if scene.sets else scene.without_variants
 
 
 def numbers(stored: MeasuredRollout) -> dict[str, Any]:

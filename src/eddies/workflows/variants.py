@@ -87,7 +87,7 @@ def rollouts(scene: Scene, directory: Path) -> dict[str, list[Place]]:
     found = {}
     for name in scene.variant or (None,):
         own, where = scene.variant[name] if name else scene.without_variants, directory / (name or "")
-        if own.tracers is not None and own.tracers.sets:
+        if own.sets:
             continue
         if scene.realisations is None:
             found[name or scene.name] = [Place(own, where)]
@@ -127,7 +127,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
     for own, where in [(whole, directory), *((replace(truth, seed=seed), place)
                                              for seed, place in zip(seeds, realisations))]:
         planned.append((None, Place(own, where), SHARED))
-        for name, tracers in own.tracers.sets.items() if own.tracers else ():
+        for name, tracers in own.sets.items():
             if tracers in used:  # the kernel is beside the ground truth of the set
                 planned.append((None, Place(replace(own, tracers=tracers), where / name), ("train-kernel",)))
     for name in chosen:

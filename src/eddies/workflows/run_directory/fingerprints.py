@@ -33,7 +33,7 @@ def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> 
         "truths": _fingerprints(training.truth_files if training else ()),
         "found_step": _digest(simulation.step_file if simulation else None),
         "confirming": _fingerprints(simulation.confirming_files if simulation else ())}
-    if scene.tracers is not None and scene.tracers.sets:  # each has its own values, and all share the others
+    if scene.sets:  # each has its own values, and all share the others
         sets = settings["tracers"].pop("sets")
         settings["tracers"] = {key: value for key, value in settings["tracers"].items() if key not in OF_A_SET} | {
             "sets": {name: {key: sets[name][key] for key in OF_A_SET} for name in sorted(sets)}}
