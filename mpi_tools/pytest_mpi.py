@@ -12,6 +12,7 @@ tests after it. Tests run in the order of their ranks. Several mpirun share the 
 ranks of a test have the same `tmp_path`, but not the same `tmp_path_factory`.
 """
 
+import gc
 import json
 import os
 import shutil
@@ -36,6 +37,7 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
+    gc.disable()  # imports of a collection make millions of objects and no garbage
     config.addinivalue_line("markers", "mpi(*ranks, timeout=120): run under mpirun on these numbers of ranks")
     folder = config.getoption("--mpi-run")
     if folder:
@@ -45,6 +47,11 @@ def pytest_configure(config):
         import mpi4py
         mpi4py.rc.initialize = mpi4py.rc.finalize = False
         config.pluginmanager.register(OuterRun(config), "mpi-outer")
+
+
+def pytest_collection_finish():
+    gc.freeze()  # later collections of garbage leave out what was imported
+    gc.enable()
 
 
 @pytest.hookimpl(tryfirst=True)
