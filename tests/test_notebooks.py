@@ -15,10 +15,10 @@ from mpi_tools.launch import mpi_environment
 
 NOTEBOOKS = Path(__file__).parents[1] / "docs" / "notebooks"
 SMALLER = ["spin_up.turnovers=0.3", "tracers.particles_per_side=8", "tracers.field_cells=12",
-           "tracers.turnovers=0.3", "kernel.steps=4", "kernel.points=50"]
+           "tracers.turnovers=0.3", "kernel.neighbors=30", "kernel.steps=4", "kernel.points=50"]
 NO_SEARCH = "simulation.step=0.1"
 TRAINED_LESS = ["training.steps=8", "training.combined_steps=2", "training.frames=2", "training.batch=64"]
-# Like the fixtures quick_spectra and no_figures, in the process of the notebooks. Only the figure of PDFs is made.
+# Like the fixtures quick_spectra and no_figures, in the process of the notebooks.
 QUICK = f"""
 %reset -f
 import sys
@@ -31,7 +31,7 @@ from eddies.workflows.rollout import particle_measures
 from tests.left_out import leave_out_figures
 
 particle_measures.MOST_ITERATIONS = 3
-leave_out_figures(pytest.MonkeyPatch(), but=["particle_pdfs"])
+leave_out_figures(pytest.MonkeyPatch(), but=BUT)
 png = figures.png
 figures.png = lambda figure: b"" if figure is None else png(figure)
 """
@@ -57,13 +57,14 @@ def kernel(folder):
 
 @pytest.fixture
 def execute(folder, kernel):
-    """A function that runs a notebook. It returns the cells by id, and the value of an expression at the end."""
-    def run(name, expression, **parameters):
+    """A function that runs a notebook, whose reports have no figures `but` those of these functions. It returns the
+    cells by id, and the value of an expression at the end."""
+    def run(name, expression, but=(), **parameters):
         notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
         (place,) = [number for number, cell in enumerate(notebook.cells)
                     if "parameters" in cell.metadata.get("tags", ())]
         given = "\n".join(f"{key} = {value!r}" for key, value in parameters.items())
-        notebook.cells.insert(place + 1, nbformat.v4.new_code_cell(QUICK + given))
+        notebook.cells.insert(place + 1, nbformat.v4.new_code_cell(QUICK.replace("BUT", repr(but)) + given))
         notebook.cells.append(nbformat.v4.new_code_cell(f"import json\nprint(json.dumps({expression}, default=float))"))
         client = NotebookClient(notebook, kernel, timeout=600, resources={"metadata": {"path": str(folder)}})
         client.execute()
@@ -90,7 +91,8 @@ def test_notebooks_are_kept_without_output():
 
 def test_a_first_run(execute, folder):
     cells, (error, without) = execute("a-first-run", "[error.values.tolist(), without.values.tolist()]",
-                                      changes=[*SMALLER, "simulation.turnovers=0.1", NO_SEARCH])
+                                      but=["particle_pdfs"], changes=[*SMALLER, "training.steps=30",
+                                                                      "simulation.turnovers=0.1", NO_SEARCH])
     shown = figures(cells)
     assert set(shown) == {"paths", "spectra", "field", "report"} and min(map(len, shown.values())) > 9000
     assert (folder / "runs/tiny/report/index.html").exists()
@@ -112,7 +114,7 @@ def test_a_term_of_ones_own(execute, folder):
 
 
 def test_another_flow(execute):
-    cells, table = execute("another-flow", "table", changes=[*SMALLER, "flow.cells=24", "simulation.turnovers=0.1"])
+    cells, table = execute("another-flow", "table", changes=[*SMALLER, "flow.cells=24", "simulation.turnovers=0.06"])
     assert set(figures(cells)) == {"figure"} and len(table) == 2
     for errors in table.values():
         assert 0 < errors["acceleration"] < errors["pressure gradient"] < 1.5
@@ -121,7 +123,7 @@ def test_another_flow(execute):
 
 def test_error_against_run_time(execute, folder):
     cells, (front, rows) = execute("error-against-run-time", "[list(front.index), table.to_dict('index')]",
-                                   changes=[*SMALLER, NO_SEARCH], turnovers=0.15)
+                                   changes=[*SMALLER, NO_SEARCH], turnovers=0.1)
     assert set(figures(cells)) == {"front"} and (folder / "runs/cost/report/index.html").exists()
     assert {row["status"] for row in rows.values()} == {"complete"}
     cost, error = ([row[key] for row in rows.values()] for key in ("wall_seconds", "velocity_error_end"))
