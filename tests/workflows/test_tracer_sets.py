@@ -148,7 +148,7 @@ def test_a_stopped_simulation_with_sets_goes_on_for_longer(comm, tmp_path, caplo
 
 
 @pytest.mark.mpi(1)
-def test_a_scene_with_sets_is_measured(comm, tmp_path, monkeypatch, caplog):
+def test_a_scene_with_sets_is_measured(comm, tmp_path, monkeypatch, caplog, no_figures):
     monkeypatch.chdir(tmp_path)
     caplog.set_level("INFO", "eddies")
     timing.run(load_scene(with_variants(tmp_path, a="few"), [*SPLIT, *SETS, "simulation.method=none"]), comm)
