@@ -244,7 +244,7 @@ def check_rows(rows):
 
 
 @pytest.mark.mpi(2, timeout=300)
-@pytest.mark.usefixtures("no_figures", "quick_spectra")
+@pytest.mark.usefixtures("no_figures", "quick_solves", "quick_spectra")
 def test_realisations_that_no_training_has_seen(comm, folder, monkeypatch):
     """One training and a rollout on each realisation. The table has mean and standard deviation of both. All ranks
     together measure and read each truth once, for any number of variants and pages."""

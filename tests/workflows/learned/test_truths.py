@@ -147,7 +147,7 @@ def twice_as_fast(source, target):
 
 
 @pytest.mark.mpi(1)
-def test_the_same_is_learned_of_the_same_flow_in_other_units(comm, tmp_path):
+def test_the_same_is_learned_of_the_same_flow_in_other_units(comm, tmp_path, quick_solves):
     """A model sees each flow in the scales of that flow."""
     scene = made(comm, tmp_path, "training.steps=4", "training.combined_steps=0", "training.acceleration_kl_weight=0",
                  "simulation.start=0.1")
