@@ -41,7 +41,7 @@ def measured(comm, tmp_path, monkeypatch, no_figures, quick_solves):
     return run
 
 
-@pytest.mark.mpi(2)
+@pytest.mark.mpi(1)
 def test_every_stage_of_the_pipeline_is_measured(comm, measured):
     found = measured(TINY, "training.horizons.steps=5", "training.horizons.frames=[1, 2]")
     for stage, steps in {"dns": 82, "train-kernel": 200, "train": 60 + 2 * 5, "simulate": 5, "report": 0}.items():
