@@ -9,7 +9,6 @@ rms of ln(E/E_experiment), means and standard deviations over the realisations, 
 """
 
 import argparse
-from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,7 @@ ENERGY = {42: (30, 60, 129, 230, 322, 435, 457, 380, 270, 168, 120, 89.0, 70.3, 
           98: (25, 55, 106, 196, 195, 202, 168, 127, 79.2, 47.8, 34.6, 28.6, 23.1, 14.3),
           171: (20, 49.7, 92.0, 120, 125, 98.0, 81.5, 60.2, 39.4, 24.1, 16.5, 12.5, 9.12, 5.62)}
 LENGTH, SPEED, MESH, WIND = 11 * 5.08 / (2 * np.pi), 22.2, 5.08, 1000.0  # units of the scene; cm and cm/s
-COLOURS = (MODEL, SECOND, THIRD, FOURTH, DNS)
+COLOURS = (MODEL, SECOND, FOURTH, THIRD, DNS)
 
 
 def filtered_experiment(station: int, shells: np.ndarray, filter_width: float) -> np.ndarray:
@@ -53,13 +52,17 @@ def cell(values: np.ndarray) -> str:
 
 
 @styled
-def draw(found: dict[str, dict[int, np.ndarray]], shells: np.ndarray, filter_width: float) -> Figure:
-    """Mean spectra of all variants at the last two stations, with the filtered experiment."""
+def draw(found: dict[str, dict[int, np.ndarray]], grids: set[str], shells: np.ndarray, filter_width: float) -> Figure:
+    """Mean spectra of all variants at the last two stations, with the filtered experiment; dashed: those of grids."""
     figure, axes = panels(1, 2, (4.2, 3.4))
+    order = sorted(found, key=lambda name: name in grids)  # grids last
+    count = len(found) - len(grids)
+    colours = dict(zip(order, [*COLOURS[:count], *COLOURS[:len(grids)]]))
     for axis, station in zip(axes.flat, (98, 171)):
         axis.loglog(shells, filtered_experiment(station, shells, filter_width), "o", color=TRUTH, label="experiment")
-        for (name, of_stations), colour in zip(found.items(), cycle(COLOURS)):
-            axis.loglog(shells, of_stations[station].mean(0), color=colour, label=name)
+        for name in order:
+            axis.loglog(shells, found[name][station].mean(0), "--" if name in grids else "-", color=colours[name],
+                        label=name)
         axis.set(title=f"$t U_0/M = {station}$", xlabel="$k$", ylabel="$E(k)$")
         number_wavenumbers(axis)
     axes.flat[0].legend(fontsize=7)
@@ -86,7 +89,8 @@ def main() -> None:
             cells += [cell(energy), cell(np.sqrt(np.mean(np.log(ratio) ** 2, axis=1)))]
         print(f"| `{name}` | {' | '.join(cells)} |")
     given.output.mkdir(parents=True, exist_ok=True)
-    draw(found, shells, filter_width).savefig(given.output / "grid-turbulence.png", dpi=100, facecolor="white")
+    grids = {name for name, variant in scene.variant.items() if variant.simulation.on_grid}
+    draw(found, grids, shells, filter_width).savefig(given.output / "grid-turbulence.png", dpi=100, facecolor="white")
 
 
 if __name__ == "__main__":
