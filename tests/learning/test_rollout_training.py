@@ -84,8 +84,8 @@ def gradient_of(comm, horizon, **choices):
 def test_gradient_is_the_same_on_two_ranks(comm, preset):
     from mpi4py import MPI
 
-    loss, gradient = gradient_of(comm, 2, preset=preset)
-    alone, expected = comm.bcast(gradient_of(MPI.COMM_SELF, 2, preset=preset) if comm.rank == 0 else None)
+    loss, gradient = gradient_of(comm, FRAMES, preset=preset)
+    alone, expected = comm.bcast(gradient_of(MPI.COMM_SELF, FRAMES, preset=preset) if comm.rank == 0 else None)
     assert loss == pytest.approx(alone, rel=1e-11)
     assert np.linalg.norm(gradient - expected) < 1e-10 * np.linalg.norm(expected)
 

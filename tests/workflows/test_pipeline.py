@@ -56,6 +56,10 @@ def test_metrics_are_finite_and_within_bounds(run_directory):
     # Three in each of nine steps, and one at the start.
     assert metrics["cost"]["evaluations_per_turnover"] == pytest.approx(28 / rollout["turnovers"])
     assert rollout["velocity_error"] < 0.95 * error_of_frozen_velocities(run_directory)
+    with h5py.File(run_directory / "ground_truth.h5") as file:
+        end, turnover = file["statistics/time"][-1], file["reference"].attrs["eddy_turnover_time"]
+    per_step, per_turnover = (metrics["cost"][f"dns_seconds_per_{word}"] for word in ("step", "turnover"))
+    assert per_turnover / per_step == pytest.approx(82 * turnover / end, rel=0.05)  # 82 steps in all
 
 
 def test_every_dataset_says_its_units_axes_and_what_it_is(run_directory):

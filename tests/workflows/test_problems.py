@@ -100,11 +100,11 @@ def test_steps_that_are_too_long_for_a_forced_rollout_or_for_a_term(comm, warned
         given = [*changes, f"simulation.integrator={integrator}", f"simulation.step={step}"]
         lines = problems_of(one_model("hit", given), comm)[1]
         assert any("relaxes so fast" in line for line in lines) is expected
-    sound = ["model.preset=wcsph", "training.horizons.steps=5"]
+    sound = ["model.preset=wcsph", "training.horizons.steps=5", "model.wcsph.speed=0.8"]
     line, = (line for line in warned(*sound) if "sound" in line)
     scene = load_scene(TINY, sound)
-    # Monaghan (1992), with an alpha of 0.05.
-    longest = 0.4 * scene.interaction_radius / 2 / (scene.flow.sound_speed * 1.03)
+    # Monaghan (1992), with an alpha of 0.05 and a speed of 0.8.
+    longest = 0.4 * scene.interaction_radius / 2 / (0.8 * scene.flow.sound_speed * 1.03)
     assert float(line.partition("at most ")[2].split()[0]) == pytest.approx(longest, rel=0.1)
     assert warned(*sound, "simulation.step=0.001") == []
 

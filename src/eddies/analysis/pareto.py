@@ -74,9 +74,9 @@ def cheapest_grid(model: Method, grids: Sequence[Method], cost: str, times: Mapp
 
 
 def break_even(first: float, each: float, rival_first: float, rival_each: float) -> float:
-    """Turnovers after which a method has taken less time than a rival; infinite if it never has.
+    """Turnovers after which a method has taken less time than a rival; infinite if its turnovers take as long.
 
-    `first` are seconds before the first turnover, `each` those of a turnover.
+    `first` are the seconds before the first turnover, `each` those of a turnover.
     """
     if each >= rival_each:
         return math.inf

@@ -363,9 +363,11 @@ def _cost(file: File, kind: str) -> list[Metric]:
     if kind == "ground_truth":
         statistics, turnover = read_table(file, "statistics"), file["reference"].attrs["eddy_turnover_time"]
         seconds = float(np.median(statistics["seconds_per_step"]))
-        steps = turnover / float(np.median(statistics["time_step"]))
+        elapsed = np.diff(statistics["time"])
+        steps = float(np.sum(elapsed / statistics["time_step"][1:]) / elapsed.sum() * turnover) if len(elapsed) else None
         return [Metric("dns_seconds_per_step", "DNS: seconds of a step (median, without storing)", seconds),
-                Metric(SIMULATION, "DNS: wall seconds of a turnover (median step)", steps * seconds)]
+                Metric(SIMULATION, "DNS: wall seconds of a turnover (mean number of steps)",
+                       None if steps is None else steps * seconds, "the simulation took no step")]
     if kind != "rollout":
         return []
     attributes = read_attributes(file, "rollout")

@@ -109,8 +109,8 @@ def simulation_seconds(scene: Scene, rows: Sequence[Mapping[str, Any]], of_truth
 def add_break_even(rows: Sequence[dict[str, Any]], simulation: float | None) -> None:
     """Add the numbers of BREAK_EVEN to the rows of trained methods.
 
-    The errors are those at T/2, or at the end of shorter rollouts; means over realisations are compared. `simulation`
-    are the wall seconds of a turnover of the direct simulation, None if unknown. A grid counts with its search.
+    Compares mean errors at T/2, or at the end of shorter rollouts. The search of a grid counts. `simulation`: wall
+    seconds of a turnover of the direct simulation, None if unknown.
     """
     known = [row for row in rows if row["status"] == "complete" and row["wall_seconds"] is not None]
     measure = "velocity_error_half" if any(row["velocity_error_half"] is not None for row in known) else (
