@@ -364,10 +364,10 @@ def _cost(file: File, kind: str) -> list[Metric]:
         statistics, turnover = read_table(file, "statistics"), file["reference"].attrs["eddy_turnover_time"]
         seconds = float(np.median(statistics["seconds_per_step"]))
         elapsed = np.diff(statistics["time"])
-        steps = float(np.sum(elapsed / statistics["time_step"][1:]) / elapsed.sum() * turnover) if len(elapsed) else None
+        steps = (elapsed / statistics["time_step"][1:]).sum() / elapsed.sum() * turnover if len(elapsed) else None
         return [Metric("dns_seconds_per_step", "DNS: seconds of a step (median, without storing)", seconds),
                 Metric(SIMULATION, "DNS: wall seconds of a turnover (mean number of steps)",
-                       None if steps is None else steps * seconds, "the simulation took no step")]
+                       None if steps is None else float(steps) * seconds, "the simulation took no step")]
     if kind != "rollout":
         return []
     attributes = read_attributes(file, "rollout")
