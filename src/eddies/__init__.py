@@ -9,10 +9,11 @@ __version__ = "2.0.0"
 _HOMES = {
     "eddies.api": ("check", "run", "simulate", "train"),
     "eddies.stored_run": ("StoredRun", "open_run"),
+    "eddies.io.track_files": ("read_tracks", "write_tracks"),
     "eddies.errors": ("UserError",),
     "eddies.import_path": ("ImportPathError",),
     "eddies.scene.scene": ("Scene", "SceneError", "load_scene", "Eulerian", "Flow", "Forcing", "Horizons", "Initial",
-                           "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training"),
+                           "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Tracks", "Training"),
     "eddies.scene.values": ("boolean", "choice", "integer", "integers", "named", "number", "text", "texts"),
     "eddies.scene.terms": ("TermError", "TermSettings"),
     "eddies.particles.terms.term": ("PairTerm", "Term"),

@@ -36,8 +36,9 @@ class Stage:
 
 
 STAGES = {stage.name: stage for stage in (
-    Stage("dns", "ground truth: direct simulation, filter, tracers", "flow", "ground_truth",
-          ("seed", "flow", "initial", "start", "forcing", "time", "spin_up", "tracers", "own_flow", "own_initial"),
+    Stage("dns", "ground truth: direct simulation, filter, tracers; or measured tracks", "flow", "ground_truth",
+          ("seed", "tracks", "flow", "initial", "start", "forcing", "time", "spin_up", "tracers", "own_flow",
+           "own_initial"),
           (), "checkpoints"),
     Stage("train-kernel", "the smoothing kernel", "kernel", "kernel", ("kernel", "window"),
           ("dns",), "checkpoints-kernel", but=("kernel.form",)),

@@ -68,6 +68,9 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
         ProductError: an input is missing that `stages` do not make.
         VariantsFailed: variants failed; the products of the others are complete.
     """
+    if scene.tracks is not None:
+        from eddies.workflows.tracks import with_tracks  # imports torch
+        scene = with_tracks(scene, comm)
     settings = [scene.to_toml(), *(stage_fingerprint(scene, stage) for stage in scene.stages), str(directory), *stages,
                 *variants]
     require_same(comm, hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:16],
@@ -189,7 +192,8 @@ def run_stage(name: str, arguments: Sequence[Any], comm: Comm, directory: Path, 
     are added."""
     log.info("%s: starts on %d %s", name, comm.size, "rank" if comm.size == 1 else "ranks")
     start = time.perf_counter()
-    run = import_module(f"eddies.workflows.{MODULES[name]}").run
+    of_tracks = name == "dns" and arguments[0].tracks is not None
+    run = import_module(f"eddies.workflows.{'tracks' if of_tracks else MODULES[name]}").run
     stop.check()
     try:
         run(*arguments)

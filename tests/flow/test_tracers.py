@@ -17,7 +17,8 @@ def followed(comm, width, amplitude=1.0):
     """Tracers of a filtered ABC flow, and the flow."""
     grid = make_grid(comm, 16)
     state = initial_fields.abc(grid, amplitude, 1)
-    tracers = TracerParticles(FilteredField(grid, width, "quintic"), release(grid.decomposition, 3, 4, "random"), state)
+    released = release(grid.decomposition, 3, 4**3, "random")
+    tracers = TracerParticles(FilteredField(grid, width, "quintic"), released, state)
     return tracers, state
 
 
@@ -42,10 +43,10 @@ def test_a_particle_may_move_through_as_many_planes_as_the_margin(comm):
 def test_release_depends_on_id_and_seed_only(comm):
     """And each particle of a lattice starts in its cell."""
     slab = SlabDecomposition(comm, LENGTH, 9)
-    particles = release(slab, 3, 6, "random")
+    particles = release(slab, 3, 6**3, "random")
     assert np.array_equal(particles["position"], random_positions(3, 216, 0, 216, LENGTH)[particles["id"]])
     assert np.all(slab.owner_of(particles["position"][:, 2]) == comm.rank)
-    lattice = release(slab, 3, 5, "lattice")
+    lattice = release(slab, 3, 5**3, "lattice")
     positions = lattice_positions(3, 5, 0, 125, LENGTH)
     assert np.array_equal(lattice["position"], positions[lattice["id"]])
     assert len(np.unique(np.floor(positions / (LENGTH / 5)), axis=0)) == 125

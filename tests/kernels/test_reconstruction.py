@@ -52,7 +52,7 @@ def averages_by_torch(field, kernel):
 def test_averages_are_those_of_torch(comm, library, monkeypatch, kind, dtype, rounding, neighbors):
     """Also with so few neighbours that some points have none, and gradients are quotients of small numbers."""
     slab = SlabDecomposition(comm, LENGTH, 15)
-    position = torch.from_numpy(release(slab, 3, 12, "random")["position"])
+    position = torch.from_numpy(release(slab, 3, 12**3, "random")["position"])
     support = LENGTH / 12 * (neighbors / (4 / 3 * np.pi)) ** (1 / 3)
     field = ParticleField(slab, 1.2 * support, position, torch.sin(2 * position), dtype)
     with torch.no_grad():

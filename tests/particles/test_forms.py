@@ -26,7 +26,7 @@ def form(name, kernel=None):
 
 def field_of(comm, velocity, placement="random", move=lambda x: x, dtype=torch.float64):
     slab = SlabDecomposition(comm, LENGTH, CELLS)
-    position = torch.from_numpy(release(slab, 3, SIDE, placement)["position"])
+    position = torch.from_numpy(release(slab, 3, SIDE**3, placement)["position"])
     return ParticleField(slab, SUPPORT, move(position), velocity(position).to(dtype), dtype)
 
 

@@ -13,7 +13,7 @@ LENGTH = 2 * np.pi
 
 def field_of(comm, per_side=16, cells=12):
     slab = SlabDecomposition(comm, LENGTH, cells)
-    position = torch.from_numpy(release(slab, 3, per_side, "random")["position"])
+    position = torch.from_numpy(release(slab, 3, per_side**3, "random")["position"])
     return ParticleField(slab, 2.5 * LENGTH / per_side, position, torch.cos(position), torch.float64)
 
 

@@ -28,7 +28,7 @@ def frames_of_tracers(grid):
     """Position and velocity of tracers in decaying turbulence, by id, at three successive times after 0.6."""
     fluid = IncompressibleFluid(grid, VISCOSITY)
     state, advance = march(fluid, initial_fields.random_velocity(grid, 5, 1.0, 1.5), 0.06, 10), ETDRK4(fluid)
-    columns = release(grid.decomposition, 3, PER_SIDE, "lattice")
+    columns = release(grid.decomposition, 3, PER_SIDE**3, "lattice")
     tracers = TracerParticles(FilteredField(grid, WIDTH, "quintic"), columns, state)
     found = []
     for _ in range(3):

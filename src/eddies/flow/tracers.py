@@ -1,5 +1,7 @@
 """Tracers: fluid particles that follow the filtered velocity of a simulation."""
 
+import math
+
 import numpy as np
 
 from eddies.parallel.migration import id_block, migrate, wrap
@@ -28,14 +30,14 @@ def lattice_positions(seed: int, per_side: int, start: int, stop: int, length: f
     return wrap((corner + 0.5 + 0.5 * jitter) * cell, length)
 
 
-def release(decomposition: SlabDecomposition, seed: int, per_side: int, placement: str) -> dict[str, np.ndarray]:
-    """Return ids and positions of per_side^3 new particles, each on the rank whose slab holds it."""
-    total = per_side**3
+def release(decomposition: SlabDecomposition, seed: int, total: int, placement: str) -> dict[str, np.ndarray]:
+    """Return ids and positions of new particles, each on the rank whose slab holds it. A lattice needs a cube of them.
+    """
     start, stop = id_block(decomposition.comm, total)
     if placement == "random":
         positions = random_positions(seed, total, start, stop, decomposition.length)
     else:
-        positions = lattice_positions(seed, per_side, start, stop, decomposition.length)
+        positions = lattice_positions(seed, round(math.cbrt(total)), start, stop, decomposition.length)
     return migrate(decomposition, {"id": np.arange(start, stop, dtype=np.int64), "position": positions})
 
 

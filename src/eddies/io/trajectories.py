@@ -38,7 +38,7 @@ class TrajectoryWriter:
 
     def __init__(self, file: h5py.File, name: str, total: int, length: float,
                  columns: Mapping[str, tuple[int, ...]], dtype: str | np.dtype, images: bool = False) -> None:
-        _write_header(file)
+        write_h5md_header(file)
         self._group = file.create_group(f"particles/{name}")
         box = self._group.create_group("box")
         write_attributes(box, {"edge": length, "dimension": 3, "boundary": np.array([b"periodic"] * 3)})
@@ -126,7 +126,8 @@ class Trajectory:
         return read_frame(find_group(self._group, column)["value"], frame, (rows,), limit)
 
 
-def _write_header(file: h5py.File) -> None:
+def write_h5md_header(file: h5py.File) -> None:
+    """Write the group /h5md, unless it is there."""
     if "h5md" in file:
         return
     header = file.create_group("h5md")

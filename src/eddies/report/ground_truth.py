@@ -42,19 +42,19 @@ METRICS = {
 
 
 def section(statistics: Table, spectra: Table, reference: Mapping[str, float], planes: Table,
-            field_name: str) -> Section:
+            field_name: str, source: str = "Direct numerical simulation.") -> Section:
     """Return the section from the tables `statistics` and `spectra` and the attributes `reference`.
 
     Numbers are those at the release of the tracers, or at the end if there are no tracers. planes: "velocity" (u_x)
     and "vorticity" (magnitude) [y, x] at z = pi of the last field called `field_name`. Times of spectra count from the
-    release of the tracers, times of statistics from the start.
+    release of the tracers, times of statistics from the start. source: where the flow comes from.
     """
     released, times = reference.get("released_at"), statistics["time"]
     row = -1 if released is None else int(np.argmin(np.abs(times - released)))
     at = {name: float(values[row]) for name, values in statistics.items()} | dict(reference)
     when = "at the end" if released is None else "at the release of the tracers"
     shown = Section(
-        "ground_truth", "Ground truth", f"Direct numerical simulation. Numbers {when}, t = {at['time']:.3g}.",
+        "ground_truth", "Ground truth", f"{source} Numbers {when}, t = {at['time']:.3g}.",
         metrics=[Metric(key, label, at.get(key), "an incompressible fluid has none")
                  for key, label in METRICS.items() if key in at or key == "mach_turbulent"],
         main=("reynolds_lambda", "kmax_eta", "mach_turbulent"))

@@ -22,7 +22,7 @@ from eddies.scene.values import SceneError
 BUILT_IN = Path(__file__).parents[1] / "scenes"
 VARIANT = "variant"
 OF_FILES = ("base", "unset")  # keys that only a file may have
-FILE_KEYS = {"initial": ("path",), "model": ("path",), "training": ("truths",),
+FILE_KEYS = {"initial": ("path",), "tracks": ("path",), "model": ("path",), "training": ("truths",),
              "simulation": ("step_from", "confirmed_on")}
 DEEPEST = 3  # parts of a dotted key: [section.sub.key], and the same in [variant.NAME]
 

@@ -19,12 +19,13 @@ from eddies.scene.layers import (BUILT_IN, OF_FILES, VARIANT, Layer, check_comma
 from eddies.scene.model import Model
 from eddies.scene.rules import quoted
 from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, NEIGHBORS, Eulerian, Flow, Forcing, Horizons, Initial,
-                                   Kernel, Simulation, SpinUp, Time, Tracers, Training)
+                                   Kernel, Simulation, SpinUp, Time, Tracers, Tracks, Training)
 from eddies.scene.values import (SceneError, Section, choice, import_paths, integer, integers, place, read_section,
                                  section, sections, text, write_section)
 
 __all__ = ["BOX_LENGTH", "REALISATION", "Scene", "SceneError", "builtin_scenes", "load_scene", "Eulerian", "Flow",
-           "Forcing", "Horizons", "Initial", "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training"]
+           "Forcing", "Horizons", "Initial", "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Tracks",
+           "Training"]
 
 REALISATION = checks.REALISATION
 # The keys of a scene that a variant cannot change.
@@ -37,6 +38,9 @@ FOREIGN_IN = ("flow", "initial", "model", "simulation")
 class Scene(Section):
     """A whole scene; making one checks its values and that its sections fit together (SceneError).
 
+    A scene with [tracks] gets the sections `flow` and `tracers` from the file with the tracks, when it is run
+    (`workflows.tracks.with_tracks`); before they are None, and the sections are not compared.
+
     `variant` has the scenes of the variants by name, each whole and without variants of its own.
     """
 
@@ -48,7 +52,8 @@ class Scene(Section):
         "seeds of further ground truths, which no training sees: rollouts are made on each from its beginning; absent: "
         "on the ground truth of the scene, after the training window", default=None, at_least=0)
     device: str = choice("where particles are computed", "cpu", "cuda", default="cpu")
-    flow: Flow = section(Flow)
+    tracks: Tracks | None = section(Tracks, default=None)
+    flow: Flow = section(Flow, default=None)
     initial: Initial = section(Initial, default=Initial())
     forcing: Forcing | None = section(Forcing, default=None)
     time: Time = section(Time, default=Time())
@@ -63,7 +68,9 @@ class Scene(Section):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for key, problem in self._problems():
+        if self.flow is None and self.tracks is None:
+            raise SceneError("[flow]: this section is missing; every scene needs it, or [tracks]", "flow")
+        for key, problem in self._problems() if self.flow is not None else ():
             raise SceneError(f"{self._given(key)}: {problem}", key)
 
     @classmethod
@@ -105,7 +112,8 @@ class Scene(Section):
         finds = self.simulation is not None and self.simulation.finds_step
         return tuple(stage.name for stage in STAGES.values()
                      if (learned or stage.name != "train") and (finds or stage.name != "find-step")
-                     and (stage.section is None or getattr(self, stage.section) is not None))
+                     and (stage.section is None or getattr(self, stage.section) is not None
+                          or stage.name == "dns"))
 
     @property
     def stages_of_all(self) -> tuple[str, ...]:

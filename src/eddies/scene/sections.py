@@ -30,7 +30,7 @@ NEIGHBORS = 60.0
 
 @dataclass(frozen=True, kw_only=True)
 class Flow(Section):
-    """The fluid and the grid on which the direct numerical simulation resolves it."""
+    """The fluid and the grid on which the direct simulation resolves it; every scene without [tracks] needs it."""
 
     fluid: str = named("equations of motion", "incompressible", "compressible")
     cells: int = integer("grid cells along each side of the cube", at_least=8, at_most=MOST_CELLS)
@@ -116,6 +116,37 @@ class Initial(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Tracks(Section):
+    """Measured particle tracks, in the place of the direct simulation and its tracers.
+
+    Lengths have the unit of the file, and velocities that length over the unit of `time_unit`. In the run the edge of
+    the box is 2 pi, and the unit of time stays. The tracks must be there in all frames; others are left out.
+    """
+
+    path: str = text("file with the tracks")
+    format: str | None = choice("layout of the file (docs/data.md); absent: by its name and content", "h5md", "npz",
+                                "lagrangebench", "csv", default=None)
+    group: str | None = text("name of the particles or of the trajectory in a file with several", default=None)
+    box: float | None = number("edge of the periodic cube; absent: that of the file", default=None, above=0)
+    time_unit: float = number("length of the file's unit of time, in the time unit of velocities", default=1.0, above=0)
+    interval: float | None = number("time between frames, for an npz file without times", default=None, above=0)
+    filtered: bool = boolean("whether the particles follow a filtered velocity; false: that of the whole flow",
+                             default=False)
+    filter_width: float | None = number("width of the Gaussian filter; absent: twice the mean spacing", default=None,
+                                        above=0)
+    viscosity: float | None = number("kinematic viscosity, for terms that need it", default=None, above=0)
+    sound_speed: float | None = number("speed of sound, for terms that need the density; the file must have densities",
+                                       default=None, above=0)
+    noise: float = number("standard deviation of a measured coordinate", default=0.0, at_least=0)
+    field_every: int = integer("number of frames per reconstructed field", default=5, at_least=1)
+
+    @property
+    def file(self) -> Path:
+        """The file with the tracks."""
+        return expanded(self.path)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Forcing(Section):
     """Linear solenoidal forcing of the largest scales at a prescribed power."""
 
@@ -149,7 +180,7 @@ class SpinUp(Section):
 
 
 # The keys in which sets of tracers may differ.
-OF_A_SET = ("particles_per_side", "placement", "seed", "filtered", "filter_width", "field_cells")
+OF_A_SET = ("particles_per_side", "count", "placement", "seed", "filtered", "filter_width", "field_cells")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,8 +196,12 @@ class Tracers(Section):
 
     set: str | None = text("NAME of the set [tracers.NAME] to use; absent: with such sets only ground truths are made, "
                            "one for each", default=None)
-    particles_per_side: int = integer("cube root of the number of particles", at_least=2, at_most=MOST_CELLS)
-    placement: str = choice("initial positions of the particles", "random", "lattice", default="random")
+    particles_per_side: int | None = integer("cube root of the number of particles", default=None, at_least=2,
+                                             at_most=MOST_CELLS)
+    count: int | None = integer("number of particles, where particles_per_side is absent", default=None, at_least=8,
+                                at_most=MOST_CELLS**3)
+    placement: str = choice("initial positions of the particles; lattice: of particles_per_side", "random", "lattice",
+                            default="random")
     seed: int = integer("number that is added to the seed of the scene for the initial positions", default=0,
                         at_least=0, at_most=10**18)
     filtered: bool = boolean("whether the particles follow the filtered velocity; false: that of the whole flow",
@@ -189,6 +224,12 @@ class Tracers(Section):
         if self.set is not None and self.set not in sets:
             raise self.problem("set", f"there is no section [tracers.{self.set}]; there are: "
                                f"{', '.join(sets) or 'none'}")
+        if (self.particles_per_side is None) == (self.count is None):
+            raise KeyProblem("tracers", "particles_per_side", ": this key is missing (cube root of the number of "
+                             "particles); give it, or count" if self.count is None else
+                             f" = {self.particles_per_side}: count is given too; remove one of the two")
+        if self.placement == "lattice" and self.count is not None:
+            raise self.problem("placement", "needs particles_per_side; give it in place of count")
         if self.filter_width is None:
             object.__setattr__(self, "filter_width", min(2 * self.spacing, BOX_LENGTH / 2))
         object.__setattr__(self, "sets", sets)
@@ -207,10 +248,15 @@ class Tracers(Section):
             if key not in OF_A_SET:
                 raise KeyProblem(f"tracers.{name}", key, ": no key of a set; the sets share all keys of [tracers] but "
                                  f"{', '.join(OF_A_SET)}")
+        one = {"particles_per_side": None, "count": None} if {"particles_per_side", "count"} & {*own} else {}
         try:
-            return dataclasses.replace(self, sets={}, set=None, **own)
+            return dataclasses.replace(self, sets={}, set=None, **{**one, **own})
         except KeyProblem as problem:
             raise problem.within(f"tracers.{name}") from None
+
+    def with_count(self, count: int) -> Tracers:
+        """The same section with another number of particles."""
+        return dataclasses.replace(self, particles_per_side=None, count=count, placement="random")
 
     @property
     def all(self) -> tuple[Tracers, ...]:
@@ -220,12 +266,17 @@ class Tracers(Section):
     @property
     def particles(self) -> int:
         """Number of particles N."""
-        return self.particles_per_side**3
+        return self.count or (self.particles_per_side or 0) ** 3
 
     @property
     def spacing(self) -> float:
         """Mean spacing L / N^(1/3) of the particles."""
-        return BOX_LENGTH / self.particles_per_side
+        return BOX_LENGTH / self._per_side
+
+    @property
+    def _per_side(self) -> float:
+        """Cube root of the number of particles."""
+        return self.particles_per_side or math.cbrt(self.particles)
 
     def radius_of(self, neighbors: float) -> float:
         """Radius h of the ball that holds so many of the N particles on average: n = N (4/3) pi h^3 / L^3."""
@@ -233,17 +284,17 @@ class Tracers(Section):
 
     @property
     def cells(self) -> int:
-        """Cells along each side of the stored fields: as given, or 1.5 particles_per_side rounded to even."""
-        return 2 * round(0.75 * self.particles_per_side) if self.field_cells is None else self.field_cells
+        """Cells along each side of the stored fields: as given, or 1.5 N^(1/3) rounded to even."""
+        return 2 * round(0.75 * self._per_side) if self.field_cells is None else self.field_cells
 
     @property
     def planes(self) -> int:
         """Cells along each side of the grid of the resolved velocity, at whose planes the particles' slabs are cut.
 
-        1.75 particles_per_side rounded to even: the shortest resolved wave has 1.5 times the particles' Nyquist
+        1.75 N^(1/3) rounded to even: the shortest resolved wave has 1.5 times the particles' Nyquist
         wavenumber and 2.3 cells, which cubic splines can follow.
         """
-        return 2 * round(0.875 * self.particles_per_side)
+        return 2 * round(0.875 * self._per_side)
 
 
 #: Values of absent keys of [kernel], and those of a preset in their place.

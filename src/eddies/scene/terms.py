@@ -58,6 +58,7 @@ class TermSettings(Section):
         grid) and "density" (computed, stored, and needed in the ground truth). Nothing else is built for it.
     gives : any of "acceleration", "density" (a part of it), "density_rate" and "shift_velocity".
     learns_through_horizons : only training through several steps of the simulation fits its parameters.
+    viscous : it needs the viscosity of the fluid.
     damps_by : its parameter with rates of damping by wavenumber, which a coarse grid can take; empty: it has none.
     too_long : error for a step beyond `longest_step`, with the term's {name}, the {longest} step and the {integrator}.
     """
@@ -66,6 +67,7 @@ class TermSettings(Section):
     reads: ClassVar[tuple[str, ...]] = ()
     gives: ClassVar[tuple[str, ...]] = ("acceleration",)
     learns_through_horizons: ClassVar[bool] = False
+    viscous: ClassVar[bool] = False
     damps_by: ClassVar[str] = ""
     too_long: ClassVar[str] = ""
 
@@ -199,7 +201,7 @@ class Stress(TermSettings):
 class Viscosity(TermSettings):
     """Molecular viscosity of the resolved velocity."""
 
-    word = "viscosity"
+    word, viscous = "viscosity", True
     reads = ("resolved",)
 
 
@@ -285,7 +287,7 @@ class TransportVelocity(TermSettings):
 class FilteredEquations(TermSettings):
     """The filtered equations of motion with derivatives from neighbours, by kriging."""
 
-    word = "filtered-equations"
+    word, viscous = "filtered-equations", True
 
     sweeps: int = integer("iterations of the pressure among neighbours in each evaluation", default=8, at_least=1,
                           at_most=32)

@@ -28,6 +28,9 @@ def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
 
     Raises SceneError at the end if a run would be refused.
     """
+    if scene.tracks is not None:
+        from eddies.workflows.tracks import with_tracks  # imports torch
+        scene = with_tracks(scene, comm)
     found, subject = numbers(scene, comm), ""
     if comm.rank == 0 and as_json:
         print(json.dumps(found, indent=2, allow_nan=False))

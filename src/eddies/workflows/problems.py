@@ -222,7 +222,7 @@ def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str
     make are not read."""
     scene, stages, model = step.scene, step.stages, step.scene.model if "train" in step.stages else None
     try:
-        if "dns" in stages and scene.initial.flow.from_file:
+        if "dns" in stages and scene.initial.flow.from_file and scene.tracks is None:
             with stored_states(scene.initial, comm):
                 pass
         if "dns" in stages and scene.initial.kind == "spectrum":

@@ -55,6 +55,9 @@ ROLLOUT_COST = {"seconds_per_step": "rollout: seconds of a step (median, without
                 "particles": "particles of the rollout",
                 "ranks": "ranks of the rollout"}
 SIMULATION = "dns_seconds_per_turnover"
+SOURCE_OF_TRACKS = ("{count} measured tracks of {file}, those of {in_file} that are there in all frames. Fields are "
+                    "reconstructed from them by least squares. The dissipation rate is that of the literature for this "
+                    "velocity and integral scale.")
 MAIN_PAGE = 3  # the main page takes as long as this many other pages; so does a round of pages
 Row = dict[str, Any]
 
@@ -321,7 +324,11 @@ def _ground_truth_sections(file: File) -> list[Section]:
         spectra = {"wavenumber": wavenumber, "energy": energy[None]}
     if not np.any(spectra["energy"]):
         return [Section("ground_truth", "Ground truth", notices=["The flow is at rest: its velocity is zero."])]
-    sections = [ground_truth.section(statistics, spectra, reference, planes, name)]
+    source = {}
+    if "tracks" in file:
+        about = read_attributes(file, "tracks")
+        source = {"source": SOURCE_OF_TRACKS.format(count=file["particles/tracers/id"].shape[0], **about)}
+    sections = [ground_truth.section(statistics, spectra, reference, planes, name, **source)]
     if "stationary" in file:
         try:
             sections.append(stationary.section(statistics, read_stationary_span(file)))
@@ -360,6 +367,8 @@ def _rollout_sections(measured: Rollout, page: Page, main: bool) -> list[Section
 
 def _cost(file: File, kind: str) -> list[Metric]:
     """Return the cost of the steps that made a product."""
+    if kind == "ground_truth" and "tracks" in file:
+        return []
     if kind == "ground_truth":
         statistics, turnover = read_table(file, "statistics"), file["reference"].attrs["eddy_turnover_time"]
         seconds = float(np.median(statistics["seconds_per_step"]))

@@ -26,7 +26,7 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import Stopped, StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
-from eddies.scene.scene import Scene, Training
+from eddies.scene.scene import Scene, SceneError, Training
 from eddies.workflows import dns, find_step, report, simulate, train, train_kernel
 from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.ground_truth.frame_counts import TESTED_FRAMES
@@ -60,6 +60,9 @@ class StepTimes(StopRequest):
 def run(scene: Scene, comm: Comm, signals: Sequence[int] = ()) -> None:
     """Log seconds a step and wall time of each stage, of all variants, on one ground truth; all ranks call it. Raises
     Stopped after a signal."""
+    if scene.tracks is not None:
+        raise SceneError(f"{scene.name}: `eddies check --time` shortens direct simulations, and this scene has "
+                         "[tracks]; run it, and read the times in the report")
     stop = StepTimes(comm, signals)
     log.info("%s: measured on %d %s", scene.name, comm.size, "rank" if comm.size == 1 else "ranks")
     log.info("%-28s  s a step     steps  wall time", "stage")

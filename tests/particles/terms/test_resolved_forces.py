@@ -299,7 +299,7 @@ def test_the_forcing_is_that_of_the_direct_simulation_filtered(comm):
     velocity, force = random_flow(grid, 3, 1.0, 2.0), np.zeros((3, *grid.spectral_shape), complex)
     LinearForcing(grid, rate, wavenumber).add(velocity, force)
     field = FilteredField(grid, 2 * spacing, "quintic")
-    columns = TracerParticles(field, release(grid.decomposition, 5, side, "random"), velocity).columns
+    columns = TracerParticles(field, release(grid.decomposition, 5, side**3, "random"), velocity).columns
     exact = torch.from_numpy(field.spline.at(field.velocity_coefficients(force), columns["position"]))
     flow = FlowUnits(replace(SCALES, filter_width=2 * spacing, spacing=spacing), CUTOFF, NEIGHBORS)
     dynamics = dynamics_of(grid.decomposition, model(forcing(rate, wavenumber), flow))

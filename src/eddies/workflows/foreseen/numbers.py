@@ -93,7 +93,7 @@ class Estimates:
 def estimate(scene: Scene) -> Estimates:
     """Estimate the turbulence, the speeds and the steps of a scene."""
     initial, time, tracers, settings = scene.initial, scene.time, scene.tracers, scene.simulation
-    turbulence = expected_turbulence(scene.flow, initial, scene.forcing)
+    turbulence = None if scene.tracks else expected_turbulence(scene.flow, initial, scene.forcing)
     peak, rms = peak_speed(scene.flow, initial, turbulence), rms_speed(initial, turbulence)
     bound = courant_step(scene.flow, time, peak)
     step, limited_by = flow_step(time, bound)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 
 from eddies.io.provenance import product_attributes
@@ -85,7 +84,7 @@ def truth_limits(path: Path, horizons: Horizons | None, tracers: Tracers, neighb
     reference = product_attributes(path, "reference")
     if "spacing" not in reference:
         return {}
-    tracers = replace(tracers, particles_per_side=round(BOX_LENGTH / reference["spacing"]))
+    tracers = tracers.with_count(round((BOX_LENGTH / reference["spacing"]) ** 3))
     limits = horizon_limits(horizons, tracers, reference["velocity_rms"], neighbors, resolves)
     if neighbors:
         limits |= reach_limit(tracers, tracers.radius_of(neighbors))

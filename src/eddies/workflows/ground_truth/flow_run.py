@@ -109,7 +109,7 @@ class TracerSet:
                                                                 settings.interpolation)
         self.comm, self.filtered = slab.comm, filters
         if saved is None:
-            columns = release(slab, seed + settings.seed, settings.particles_per_side, settings.placement)
+            columns = release(slab, seed + settings.seed, settings.particles, settings.placement)
         else:
             start, stop = id_block(self.comm, settings.particles)
             block = {name: saved.read(name + suffix, start, stop) for name in ("position", "velocity")}

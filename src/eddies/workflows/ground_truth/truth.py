@@ -94,8 +94,8 @@ class GroundTruth:
 
     @cached_property
     def at_states(self) -> list[int]:
-        """The frames at the times of the unfiltered flow."""
-        return self._frames_of(self.states)
+        """The frames at the times of the unfiltered flow; none of measured tracks."""
+        return [] if "tracks" in self._file else self._frames_of(self.states)
 
     def field_at(self, frame: int, points: torch.Tensor) -> np.ndarray:
         """The stored filtered velocity (m, 3) at the time of a frame, at the `grid_points` (m, 3) of this rank."""

@@ -49,7 +49,7 @@ def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, las
         errors = frame.errors()
         row = {"delay": truth.times[index] - truth.times[last_seen],
                "acceleration_error": relative_error(comm, errors["acceleration"], frame.acceleration)}
-        if truth.has_density:
+        if "density" in truth.fields.variables:
             exact = _pressure_force(truth, int(index), frame.particles).to(frame.acceleration)
             if FORCING in frame.kept:
                 exact = exact + frame.kept[FORCING].at(None).acceleration

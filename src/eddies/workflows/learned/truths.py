@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -61,8 +60,7 @@ def truth_problems(settings: Training, tracers: Tracers, reads: Collection[str],
 def _truth_in(file: File, tracers: Tracers, comm: Comm,
               device: torch.device = torch.device("cpu")) -> GroundTruth:
     """An open ground truth, on slabs for its own number of particles."""
-    side = round(Trajectory(file, "tracers").total ** (1 / 3))
-    planes = replace(tracers, particles_per_side=side).planes
+    planes = tracers.with_count(Trajectory(file, "tracers").total).planes
     return GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, planes), device)
 
 

@@ -28,7 +28,7 @@ def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> 
     """
     training, simulation = scene.training, scene.simulation
     settings: dict[str, Any] = asdict(scene) | {
-        "window": scene.window, "start": _digest(scene.initial.file),
+        "window": scene.window, "start": _digest(scene.tracks.file if scene.tracks else scene.initial.file),
         "weights": _digest(scene.model.weights_file if scene.model else None),
         "truths": _fingerprints(training.truth_files if training else ()),
         "found_step": _digest(simulation.step_file if simulation else None),
@@ -39,7 +39,7 @@ def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> 
             "sets": {name: {key: sets[name][key] for key in OF_A_SET} for name in sorted(sets)}}
     # The content of these files counts, not their paths.
     if settings["start"] is not None:
-        del settings["initial"]["path"]
+        del settings["tracks" if scene.tracks else "initial"]["path"]
     if settings["weights"] is not None:
         del settings["model"]["path"]
     if settings["found_step"] is not None:

@@ -1,0 +1,133 @@
+"""Velocities and accelerations along measured tracks, by smoothing splines.
+
+A track is a cubic spline with a knot at each of its times that minimises
+
+    sum_i |x_i - s(t_i)|^2 + mu h^5 int |s'''|^2 dt,    h the mean interval,
+
+the estimate for noise of equal variance and a jerk that is white noise (TrackFit; Gesemann, Huhn, Schanz and Schröder
+2016). It damps frequencies above mu^(-1/6) / h. The ends need no condition.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.linalg import solveh_banded
+from scipy.optimize import brentq
+
+DEGREE, LEAST_ROWS = 3, 3   # fewer rows do not determine a parabola, which has no jerk
+NO_NOISE, MOST = 1e-6, 1e6  # smallest and largest mu: below the smallest no frequency that frames resolve is damped
+TRIED = 300                 # tracks by which mu is chosen
+
+
+@dataclass(frozen=True)
+class SmoothedTracks:
+    """Rows of tracks after smoothing.
+
+    Parameters
+    ----------
+    rows : number of each row in the tracks that were given; tracks with fewer than three rows are left out.
+    position : continuous along a track, (rows, 3). velocity, acceleration : (rows, 3).
+    smoothing : mu.
+    """
+
+    rows: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    acceleration: np.ndarray
+    smoothing: float
+
+
+def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: float,
+           noise: float = 0.0) -> SmoothedTracks:
+    """Fit splines to tracks in a periodic cube.
+
+    Parameters
+    ----------
+    time, track : (rows,), in any order. position : (rows, 3), wrapped or not.
+    edge : of the cube. Particles move by less than half of it between two rows of a track.
+    noise : standard deviation of a coordinate. The splines differ from the positions by as much, less the degrees of
+        freedom of the splines.
+    """
+    order = np.lexsort((time, track))
+    ends = np.flatnonzero(np.diff(track[order], append=track[order][-1] - 1)) + 1
+    alike: dict[bytes, list[np.ndarray]] = defaultdict(list)
+    for start, stop in zip([0, *ends[:-1]], ends):
+        if stop - start >= LEAST_ROWS:
+            rows = order[start:stop]
+            alike[time[rows].tobytes()].append(rows)
+    groups = [np.array(rows) for rows in alike.values()]
+    if not groups:
+        nothing = np.zeros((0, 3))
+        return SmoothedTracks(np.zeros(0, int), nothing, nothing, nothing, NO_NOISE)
+    fits = [Fit(time[rows[0]], _unwrapped(position[rows], edge)) for rows in groups]
+    smoothing = _smoothing_of(fits, noise) if noise > 0 else NO_NOISE
+    values = [np.concatenate(parts) for parts in zip(*(fit.derivatives(smoothing) for fit in fits))]
+    return SmoothedTracks(np.concatenate([rows.ravel() for rows in groups]), *values, smoothing)
+
+
+class Fit:
+    """The splines of tracks with the same times (n,); positions (tracks, n, 3)."""
+
+    def __init__(self, times: np.ndarray, positions: np.ndarray) -> None:
+        self.times, self.tracks = times, len(positions)
+        self._values = np.moveaxis(positions, 1, 0).reshape(len(times), -1)
+        before, after = times[0] - times[1], times[-1] - times[-2]
+        steps = np.arange(1, DEGREE + 1)
+        self._knots = np.concatenate([times[0] + before * steps[::-1], times, times[-1] + after * steps])
+        self._basis = BSpline.design_matrix(times, self._knots, DEGREE)
+        unit = BSpline(self._knots, np.eye(len(times) + DEGREE - 1), DEGREE)
+        interval = np.diff(times)
+        jerk = unit.derivative(DEGREE)((times[1:] + times[:-1]) / 2)
+        self._penalty = np.mean(interval) ** 5 * (jerk.T * interval) @ jerk
+
+    def spline(self, smoothing: float, values: np.ndarray | None = None) -> BSpline:
+        """The splines for mu = `smoothing`, of the positions or of other values (n, columns)."""
+        matrix = (self._basis.T @ self._basis).toarray() + smoothing * self._penalty
+        bands = np.zeros((DEGREE + 1, len(matrix)))
+        for offset in range(DEGREE + 1):
+            bands[offset, :len(matrix) - offset] = np.diagonal(matrix, -offset)
+        right = self._basis.T @ (self._values if values is None else values)
+        return BSpline(self._knots, solveh_banded(bands, right, lower=True), DEGREE)
+
+    def residual(self, smoothing: float) -> tuple[float, float]:
+        """Sum of the squared residuals, and the degrees of freedom that they have: values less those of the splines."""
+        squares = float(np.sum((self.spline(smoothing)(self.times) - self._values) ** 2))
+        influence = self.spline(smoothing, np.eye(len(self.times)))(self.times)
+        return squares, 3 * self.tracks * (len(self.times) - float(np.trace(influence)))
+
+    def derivatives(self, smoothing: float) -> Iterator[np.ndarray]:
+        """Position, velocity and acceleration (tracks * n, 3), by track."""
+        spline = self.spline(smoothing)
+        for order in range(DEGREE):
+            values = spline.derivative(order)(self.times) if order else spline(self.times)
+            yield np.moveaxis(values.reshape(len(self.times), self.tracks, 3), 1, 0).reshape(-1, 3)
+
+
+def _smoothing_of(fits: list[Fit], noise: float) -> float:
+    """The mu with which residuals have the variance of the noise, from the longest tracks."""
+    chosen, tracks = [], 0
+    for fit in sorted(fits, key=lambda fit: -len(fit.times)):
+        chosen.append(fit)
+        tracks += fit.tracks
+        if tracks >= TRIED:
+            break
+
+    def excess(logarithm: float) -> float:
+        squares, freedom = np.sum([fit.residual(10.0**logarithm) for fit in chosen], axis=0)
+        return np.log(squares / freedom / noise**2 + 1e-300)
+
+    low, high = np.log10(NO_NOISE), np.log10(MOST)
+    if excess(low) >= 0:
+        return NO_NOISE
+    return MOST if excess(high) <= 0 else float(10 ** brentq(excess, low, high, xtol=0.01))
+
+
+def _unwrapped(positions: np.ndarray, edge: float) -> np.ndarray:
+    """Continuous positions (tracks, n, 3) from wrapped ones."""
+    moved = np.diff(positions, axis=1)
+    return positions - edge * np.cumsum(np.rint(np.pad(moved, ((0, 0), (1, 0), (0, 0))) / edge), axis=1)

@@ -1,0 +1,327 @@
+"""Particle tracks of experiments and other programs: read five layouts, write one.
+
+A track is the path of one particle. Tracks are kept as rows, one for each particle and time, sorted by time. Layouts:
+
+- "h5md": H5MD 1.1 (de Buyl, Colberg & Höfling, Comput. Phys. Commun. 185, 1546), also the trajectories of eddies:
+  /particles/GROUP with `position`, `velocity` and `id`. An id below 0 marks a row without a particle.
+- "npz": NumPy arrays `pos` and `vel` (frames, particles, 3) and `rho` (frames, particles), as published with Tian et
+  al. (2023), with the times in `time` (frames,) if the file has them.
+- "lagrangebench": TRAJECTORY/position (frames, particles, 3) and metadata.json beside the file (Toshev et al. 2023).
+- "csv": a table with the columns track, time, x, y, z and optionally u, v, w, as tracking programs write it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from eddies.io.errors import ProductError, file_errors
+from eddies.io.hdf5 import write_attributes
+from eddies.io.new_files import create_export
+from eddies.io.trajectories import write_h5md_header
+
+AXES = ("x", "y", "z")
+FILL = -1  # the id of a row without a particle
+MOST_OFF = 2.0  # factor between displacements and velocities times intervals that no flow explains
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Rows of tracks, sorted by time and then by id.
+
+    Parameters
+    ----------
+    time : (rows,). track : id of the track, (rows,).
+    position, velocity : (rows, 3). density : (rows,). Velocity and density are None if they were not measured.
+    edge : of the periodic cube, if the file has one.
+    """
+
+    time: np.ndarray
+    track: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray | None = None
+    density: np.ndarray | None = None
+    edge: float | None = None
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """The columns that there are, by name."""
+        found = {name: getattr(self, name) for name in ("time", "track", "position", "velocity", "density")}
+        return {name: values for name, values in found.items() if values is not None}
+
+    def chosen(self, rows: np.ndarray) -> Tracks:
+        """Some rows, by number or mask."""
+        return replace(self, **{name: values[rows] for name, values in self.columns.items()})
+
+    @cached_property
+    def times(self) -> np.ndarray:
+        """Time of each frame, (frames,)."""
+        return np.unique(self.time)
+
+    @cached_property
+    def starts(self) -> np.ndarray:
+        """First row of each frame, and the number of rows, (frames + 1,)."""
+        return np.append(np.searchsorted(self.time, self.times), len(self.time))
+
+    def displacements(self, edge: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pairs of successive rows of a track: first rows (m,), displacements (m, 3) and intervals (m,).
+
+        Displacements are those to the nearest image in a periodic cube with this edge.
+        """
+        order = np.lexsort((self.time, self.track))
+        same = self.track[order[1:]] == self.track[order[:-1]]
+        first, second = order[:-1][same], order[1:][same]
+        moved = self.position[second] - self.position[first]
+        return first, moved - edge * np.rint(moved / edge), self.time[second] - self.time[first]
+
+
+def read_tracks(path: str | Path, layout: str | None = None, group: str | None = None,
+                interval: float | None = None) -> Tracks:
+    """Read the tracks of a file.
+
+    Parameters
+    ----------
+    layout : one of LAYOUTS; None: by the name and content of the file.
+    group : name of the group of particles of an H5MD file, or of the trajectory of a LagrangeBench file, if it has
+        several.
+    interval : time between frames, for an NPZ file without times.
+
+    Raises:
+        ProductError: the file cannot be read, is no such file, or holds tracks that are not finite, incomplete, or
+            twice at one time.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ProductError(f"{path}: no such file; give the path of a file with particle tracks")
+    layout = layout or _layout_of(path)
+    if layout not in LAYOUTS:
+        raise ProductError(f"{path}: layout = {layout!r}: must be one of {', '.join(LAYOUTS)}")
+    try:
+        with file_errors(path):
+            found = LAYOUTS[layout](path, group, interval)
+    except (KeyError, ValueError, json.JSONDecodeError) as error:
+        text = " ".join(str(error.args[0] if error.args else error).split())
+        raise ProductError(f"{path}: cannot be read as {layout}: {text}") from None
+    return _checked(found, path)
+
+
+def write_tracks(path: str | Path, times: Any, ids: Any, positions: Any, velocities: Any = None,
+                 edge: float = 2 * math.pi) -> None:
+    """Write tracks as an H5MD file that `read_tracks` and `[tracks]` read.
+
+    Parameters
+    ----------
+    times, ids : time and number of the track of each row, (rows,). Ids are at least 0.
+    positions, velocities : (rows, 3); velocities may be None.
+    edge : of the periodic cube.
+
+    Raises:
+        ProductError: rows are not finite, are of unequal number, or have the same track twice at one time; or the file
+            cannot be written.
+    """
+    path = Path(path)
+    columns = {"time": np.asarray(times, float), "track": np.asarray(ids), "position": np.asarray(positions, float),
+               "velocity": None if velocities is None else np.asarray(velocities, float)}
+    tracks = _checked(Tracks(**columns, edge=float(edge)), path)
+    if tracks.track.dtype.kind not in "iu" or tracks.track.min() < 0:
+        raise ProductError(f"{path}: ids must be whole numbers, 0 or larger")
+    rows = tracks.starts[1:] - tracks.starts[:-1]
+    frames, most = len(rows), int(rows.max())
+    frame = np.repeat(np.arange(frames), rows)
+    column = np.arange(len(frame)) - np.repeat(tracks.starts[:-1], rows)
+    values = {"id": tracks.track.astype(np.int64), "position": tracks.position, "velocity": tracks.velocity}
+    layout = {f"particles/tracks/{name}/value": ((frames, most, *given.shape[1:]), given.dtype)
+              for name, given in values.items() if given is not None}
+    with create_export(path, layout, {}) as file:
+        write_h5md_header(file)
+        holder = file["particles/tracks"]
+        write_attributes(holder.create_group("box"), {"dimension": 3, "boundary": np.array([b"periodic"] * 3)})
+        holder["box/edges"] = np.full(3, tracks.edge)
+        for name, given in values.items():
+            if given is not None:
+                padded = np.full((frames, most, *given.shape[1:]), FILL if name == "id" else 0, given.dtype)
+                padded[frame, column] = given
+                holder[f"{name}/value"][:] = padded
+                holder[f"{name}/step"], holder[f"{name}/time"] = np.arange(frames), tracks.times
+
+
+# ---- layouts
+
+
+def _layout_of(path: Path) -> str:
+    """The layout of a file by its suffix; an HDF5 file without /h5md is one of LagrangeBench."""
+    suffix = path.suffix.lower()
+    if suffix in (".h5", ".hdf5", ".h5md"):
+        with _opened(path) as file:
+            return "h5md" if "particles" in file else "lagrangebench"
+    if suffix == ".npz":
+        return "npz"
+    if suffix in (".csv", ".txt", ".dat", ".tsv"):
+        return "csv"
+    raise ProductError(f"{path}: the layout does not follow from the suffix; give one of {', '.join(LAYOUTS)}")
+
+
+def _read_h5md(path: Path, group: str | None, interval: float | None) -> Tracks:
+    with _opened(path) as file:
+        holder = _chosen(path, file.get("particles", {}), group, "groups of particles")
+        element = holder["position"]
+        position = element["value"][()]
+        frames, count = position.shape[:2]
+        time = element["time"]
+        times = time[()] if time.shape else float(time.attrs.get("offset", 0.0)) + time[()] * np.arange(frames)
+        velocity, density = (holder[f"{name}/value"][()] if f"{name}/value" in holder else None
+                             for name in ("velocity", "density"))
+        ids = np.arange(count)
+        if isinstance(holder.get("id"), h5py.Dataset):
+            ids = holder["id"][()]
+        elif "id/value" in holder:
+            ids = holder["id/value"][()]
+        box = holder["box"]
+        edges = box["edges/value"][0] if "edges/value" in box else box["edges"][()] if "edges" in box else []
+        edges = np.unique(np.diag(edges) if np.ndim(edges) == 2 else edges)
+    return _from_frames(times, np.broadcast_to(ids, (frames, count)), position, velocity, density,
+                        float(edges[0]) if len(edges) == 1 else None)
+
+
+def _read_npz(path: Path, group: str | None, interval: float | None) -> Tracks:
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    if "pos" not in arrays:
+        raise ValueError(f"it holds {', '.join(arrays) or 'nothing'}, but no array pos (frames, particles, 3)")
+    frames, count = arrays["pos"].shape[:2]
+    if "time" in arrays:
+        times = arrays["time"]
+    elif interval is not None:
+        times = interval * np.arange(frames)
+    else:
+        raise ValueError("it holds no array time; give interval, the time between frames")
+    return _from_frames(times, np.broadcast_to(np.arange(count), (frames, count)), arrays["pos"], arrays.get("vel"),
+                        arrays.get("rho"))
+
+
+def _read_lagrangebench(path: Path, group: str | None, interval: float | None) -> Tracks:
+    metadata = json.loads((path.parent / "metadata.json").read_text(encoding="utf-8"))
+    with _opened(path) as file:
+        position = _chosen(path, file, group, "trajectories")["position"][()]
+    frames, count = position.shape[:2]
+    lower, upper = np.transpose(metadata["bounds"])
+    edges = np.unique(upper - lower)
+    times = float(metadata["dt"]) * int(metadata.get("write_every", 1)) * np.arange(frames)
+    return _from_frames(times, np.broadcast_to(np.arange(count), (frames, count)), position - lower, None, None,
+                        float(edges[0]) if len(edges) == 1 else None)
+
+
+def _read_csv(path: Path, group: str | None, interval: float | None) -> Tracks:
+    with open(path, encoding="utf-8") as file:
+        heading = file.readline().lstrip("\ufeff#").strip().lower()
+    delimiter = next((mark for mark in ",;\t" if mark in heading), None)
+    names = [name.strip(' "') for name in heading.split(delimiter)]
+    needed = ("track", "time", *AXES)
+    for name in needed:
+        if name not in names:
+            raise ValueError(f"the first line must name the columns {', '.join(needed)}, but it names "
+                             f"{', '.join(names)}; add or correct {name}")
+    wanted = [*needed, *(["u", "v", "w"] if {"u", "v", "w"} <= {*names} else [])]
+    table = np.loadtxt(path, delimiter=delimiter, skiprows=1, usecols=[names.index(name) for name in wanted], ndmin=2)
+    track = table[:, 0].astype(np.int64)
+    if not np.array_equal(track, table[:, 0]):
+        raise ValueError("the column track must hold whole numbers")
+    return Tracks(table[:, 1], track, table[:, 2:5], table[:, 5:] if len(wanted) > 5 else None)
+
+
+LAYOUTS: Mapping[str, Callable[[Path, str | None, float | None], Tracks]] = {
+    "h5md": _read_h5md, "npz": _read_npz, "lagrangebench": _read_lagrangebench, "csv": _read_csv}
+
+
+def _opened(path: Path) -> h5py.File:
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        raise ProductError(f"{path}: cannot be opened as HDF5 ({' '.join(str(error).split())}); the file may be "
+                           "truncated") from None
+
+
+def _chosen(path: Path, holder: Mapping[str, Any], name: str | None, what: str) -> Any:
+    """The only group of a holder, or the one with a name."""
+    if name is None and len(holder) == 1:
+        return next(iter(holder.values()))
+    if name is not None and name in holder:
+        return holder[name]
+    listed = ", ".join(list(holder)[:9]) or "none"
+    raise ProductError(f"{path}: group = {name!r}: the file has these {what}: {listed}; give one of them as group")
+
+
+def _from_frames(times: np.ndarray, ids: np.ndarray, position: np.ndarray, velocity: np.ndarray | None,
+                 density: np.ndarray | None = None, edge: float | None = None) -> Tracks:
+    """Rows from arrays over frames and particles; rows with an id below 0 are left out."""
+    if position.ndim != 3 or position.shape[2] != 3:
+        raise ValueError(f"positions have the shape {position.shape}, not (frames, particles, 3)")
+    for name, values, shape in (("times", times, position.shape[:1]), ("ids", ids, position.shape[:2]),
+                                ("velocities", velocity, position.shape), ("densities", density, position.shape[:2])):
+        if values is not None and np.shape(values) != shape:
+            raise ValueError(f"{name} have the shape {np.shape(values)}, but positions {position.shape}")
+    if np.any(np.diff(times) <= 0):
+        frame = int(np.argmax(np.diff(times) <= 0))
+        raise ValueError(f"times must increase, but frame {frame + 1} is at {times[frame + 1]:g} after "
+                         f"{times[frame]:g}")
+    there = ids >= 0
+    return Tracks(np.repeat(times, there.sum(1)).astype(float), ids[there], position[there].astype(float),
+                  None if velocity is None else velocity[there].astype(float),
+                  None if density is None else density[there].astype(float), edge)
+
+
+# ---- checks
+
+
+def _checked(tracks: Tracks, path: Path) -> Tracks:
+    """The tracks sorted by time and id. Raises ProductError for rows that are none."""
+    rows = len(tracks.time)
+    if not rows:
+        raise ProductError(f"{path}: holds no particles")
+    for name, values in tracks.columns.items():
+        shape = (rows, 3) if name in ("position", "velocity") else (rows,)
+        if values.shape != shape:
+            raise ProductError(f"{path}: {name} has the shape {values.shape}, and {rows} times need {shape}")
+        bad = np.flatnonzero(~np.isfinite(values).reshape(rows, -1).all(1))
+        if len(bad):
+            raise ProductError(f"{path}: {name} of track {tracks.track[bad[0]]} at time {tracks.time[bad[0]]:g} is not "
+                               f"finite ({len(bad)} such rows); leave these rows out")
+    sorted_tracks = tracks.chosen(np.lexsort((tracks.track, tracks.time)))
+    time, track = sorted_tracks.time, sorted_tracks.track
+    twice = np.flatnonzero((np.diff(time) == 0) & (np.diff(track) == 0))
+    if len(twice):
+        raise ProductError(f"{path}: track {track[twice[0]]} is there twice at time {time[twice[0]]:g} ({len(twice)} "
+                           "such rows); give each particle an id of its own")
+    return sorted_tracks
+
+
+def check_box(tracks: Tracks, edge: float, path: str | Path) -> None:
+    """Raise ProductError for positions outside the cube, or velocities that contradict displacements.
+
+    Both mean that lengths or times have another unit than the file is said to have.
+    """
+    outside = np.flatnonzero(((tracks.position < 0) | (tracks.position > edge)).any(1))
+    if len(outside):
+        row = outside[0]
+        raise ProductError(f"{path}: track {tracks.track[row]} at time {tracks.time[row]:g} is at "
+                           f"({', '.join(f'{x:.4g}' for x in tracks.position[row])}), outside the box from 0 to "
+                           f"{edge:g} ({len(outside)} such rows); correct the box or the unit of length")
+    if tracks.velocity is None:
+        return
+    first, moved, interval = tracks.displacements(edge)
+    if not len(first):
+        return
+    given = np.linalg.norm(tracks.velocity[first], axis=1)
+    measured = np.linalg.norm(moved, axis=1) / interval
+    factor = float(np.median(measured) / max(np.median(given), 1e-300))
+    if not 1 / MOST_OFF < factor < MOST_OFF:
+        raise ProductError(f"{path}: particles move {factor:.3g} times as far between frames as their velocities say; "
+                           "correct time_unit, the box, or the unit of the velocities, or leave the velocities out")

@@ -1,0 +1,138 @@
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from eddies.io.errors import ProductError
+from eddies.io.track_files import Tracks, check_box, read_tracks, write_tracks
+
+pytestmark = pytest.mark.mpi(1)
+
+EDGE = 3.0
+
+
+def shear(times, count=20, seed=1):
+    """Tracks in the shear flow u = (sin 2 pi y / L, 0, 0), some of which begin late or end early."""
+    draw = np.random.default_rng(seed)
+    start = draw.uniform(0, EDGE, (count, 3))
+    speed = np.sin(2 * np.pi * start[:, 1] / EDGE)
+    time, track = (part.ravel() for part in np.meshgrid(times, np.arange(count), indexing="ij"))
+    position = start[track]
+    position[:, 0] = (position[:, 0] + speed[track] * time) % EDGE
+    velocity = np.stack([speed[track], 0 * time, 0 * time], 1)
+    there = (track % 3 != 0) | (time > times[1])
+    return time[there], track[there], position[there], velocity[there]
+
+
+def assert_same(found, rows):
+    time, track, position, velocity = rows
+    order = np.lexsort((track, time))
+    np.testing.assert_array_equal(found.time, time[order])
+    np.testing.assert_array_equal(found.track, track[order])
+    np.testing.assert_allclose(found.position, position[order], rtol=0, atol=1e-12)
+    if found.velocity is not None:
+        np.testing.assert_allclose(found.velocity, velocity[order], rtol=0, atol=1e-12)
+
+
+def test_tracks_that_are_written_are_read_in_any_order(tmp_path):
+    rows = shear(np.array([0.0, 0.1, 0.3, 0.4]))
+    shuffled = np.random.default_rng(2).permutation(len(rows[0]))
+    write_tracks(tmp_path / "t.h5", *(part[shuffled] for part in rows), edge=EDGE)
+    found = read_tracks(tmp_path / "t.h5")
+    assert_same(found, rows)
+    assert found.edge == EDGE
+    check_box(found, EDGE, "t.h5")
+
+
+def test_a_table_of_a_tracking_program(tmp_path):
+    rows = shear(np.linspace(0, 1, 5))
+    table = np.column_stack([rows[1], rows[0], rows[2], rows[3]])
+    for delimiter, name in ((",", "a.csv"), (" ", "a.dat"), ("\t", "a.tsv")):
+        np.savetxt(tmp_path / name, table, delimiter=delimiter, fmt="%.17g", comments="# ",
+                   header=delimiter.join(["Track", "time", "x", "y", "z", "u", "v", "w"]))
+        assert_same(read_tracks(tmp_path / name), rows)
+
+
+def test_arrays_as_published_with_the_paper(tmp_path):
+    position = np.random.default_rng(1).uniform(0, EDGE, (4, 9, 3)).astype(np.float32)
+    np.savez(tmp_path / "a.npz", pos=position, vel=-position, rho=np.ones((4, 9)))
+    found = read_tracks(tmp_path / "a.npz", interval=0.5)
+    np.testing.assert_array_equal(found.times, [0, 0.5, 1, 1.5])
+    np.testing.assert_array_equal(found.position.reshape(4, 9, 3), position)
+    np.testing.assert_array_equal(found.velocity, -found.position)
+    with pytest.raises(ProductError, match="a.npz.*interval"):
+        read_tracks(tmp_path / "a.npz")
+
+
+def test_a_trajectory_of_lagrangebench(tmp_path):
+    position = np.random.default_rng(1).uniform(0, 1, (4, 9, 3))
+    (tmp_path / "metadata.json").write_text(json.dumps({"dt": 0.1, "write_every": 5, "bounds": [[-1, 1]] * 3}))
+    with h5py.File(tmp_path / "train.h5", "w") as file:
+        for name in ("00000", "00001"):
+            file[f"{name}/position"] = position
+    found = read_tracks(tmp_path / "train.h5", group="00001")
+    np.testing.assert_array_equal(found.position.reshape(4, 9, 3), position + 1)
+    np.testing.assert_array_equal(found.times, 0.5 * np.arange(4))
+    assert found.edge == 2
+    with pytest.raises(ProductError, match="group = None.*00000, 00001"):
+        read_tracks(tmp_path / "train.h5")
+
+
+def test_h5md_with_a_constant_interval_and_an_offset(tmp_path):
+    position = np.random.default_rng(1).uniform(0, 1, (3, 5, 3))
+    with h5py.File(tmp_path / "md.h5", "w") as file:
+        holder = file.create_group("particles/all")
+        holder["position/value"], holder["position/time"] = position, 0.25
+        holder["position/time"].attrs["offset"] = 2.0
+        holder["box/edges/value"] = np.broadcast_to(np.eye(3), (3, 3, 3))
+    found = read_tracks(tmp_path / "md.h5")
+    np.testing.assert_array_equal(found.times, [2, 2.25, 2.5])
+    assert found.edge == 1 and found.velocity is None
+
+
+def changed(rows, **changes):
+    columns = dict(zip(("times", "ids", "positions", "velocities"), (part.copy() for part in rows)))
+    for name, value in changes.items():
+        columns[name][3] = value
+    return columns
+
+
+@pytest.mark.parametrize("changes, words", [
+    ({"positions": np.nan}, "position of track .* not finite"), ({"times": np.inf}, "time of track .* not finite"),
+    ({"ids": 1, "times": 0.0}, "track 1 is there twice at time 0"), ({"ids": -5}, "whole numbers, 0 or larger")])
+def test_rows_that_are_none_are_refused_before_anything_is_written(tmp_path, changes, words):
+    with pytest.raises(ProductError, match=words):
+        write_tracks(tmp_path / "t.h5", **changed(shear(np.array([0.0, 0.1, 0.2])), **changes))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name, content, words", [
+    ("a.csv", "track,time,x,y\n1,0,0,0\n", "names track, time, x, y; add or correct z"),
+    ("a.csv", "trakc,time,x,y,z\n1,0,0,0,0\n", "names trakc, .*; add or correct track"),
+    ("a.csv", "track,time,x,y,z\n1,0,0,0\n", "as csv"),
+    ("a.csv", "track,time,x,y,z\n1.5,0,0,0,0\n", "whole numbers"),
+    ("a.h5", "cut short", "HDF5"), ("a.npz", "cut short", "as npz"), ("a.bin", "", "suffix"),
+    (None, "", "no such file")])
+def test_unfit_files_are_named_with_the_reason(tmp_path, name, content, words):
+    if name:
+        (tmp_path / name).write_text(content)
+    with pytest.raises(ProductError, match=words) as caught:
+        read_tracks(tmp_path / (name or "missing.csv"))
+    assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
+
+
+def test_times_that_do_not_increase(tmp_path):
+    np.savez(tmp_path / "a.npz", pos=np.zeros((3, 2, 3)), time=np.array([0.0, 2.0, 1.0]))
+    with pytest.raises(ProductError, match="times must increase, but frame 2 is at 1 after 2"):
+        read_tracks(tmp_path / "a.npz")
+
+
+def test_units_that_contradict_each_other():
+    time, track, position, velocity = shear(np.linspace(0, 1, 11))
+    tracks = Tracks(time, track, position, velocity)
+    check_box(tracks, EDGE, "f")
+    with pytest.raises(ProductError, match="outside the box"):
+        check_box(tracks, 0.9 * EDGE, "f")
+    with pytest.raises(ProductError, match="0.01 times as far"):
+        check_box(Tracks(100 * time, track, position, velocity), EDGE, "f")

@@ -1,0 +1,167 @@
+"""Measured tracks in the place of a direct simulation; here they are the tracers of one, so the truth is known."""
+
+import h5py
+import numpy as np
+import pytest
+
+from eddies import open_run, run
+from eddies.io.errors import ProductError
+from eddies.scene.scene import SceneError, load_scene
+from eddies.workflows import tracks
+from tests.workflows.small_rollout import prepared
+
+MILLIMETRES, MILLISECONDS = 20.0, 4.0  # edge of the box, and the time unit of the file in that of the flow
+ARRAYS = {"pos": "position", "vel": "velocity", "rho": "density"}
+SECTION = """[tracks]
+path = "{path}"
+box = 20.0
+time_unit = {unit}
+filtered = true
+field_every = 2
+"""
+
+
+@pytest.fixture(scope="session")
+def twin(comm, shared_folder):
+    """A folder with the ground truth of a simulation with 10^3 tracers, and its tracers as a table without velocities.
+
+    Rows are shuffled, lengths are in millimetres, and 20 particles are lost after half of the frames."""
+    folder = shared_folder()
+    prepared(comm, folder, overrides=["tracers.particles_per_side=10", "flow.cells=16", "tracers.field_cells=14"])
+    if comm.rank == 0:
+        with h5py.File(folder / "ground_truth.h5") as file:
+            times, position = (file[f"particles/tracers/position/{name}"][()] for name in ("time", "value"))
+        frames, count = position.shape[:2]
+        rows = np.column_stack([np.tile(np.arange(count), frames), np.repeat(times / MILLISECONDS, count),
+                                position.reshape(-1, 3) * MILLIMETRES / (2 * np.pi)])
+        lost = (rows[:, 0] < 20) & (rows[:, 1] > rows[:, 1].mean())
+        rows = np.random.default_rng(1).permutation(rows[~lost])
+        np.savetxt(folder / "tracks.csv", rows, delimiter=",", header="track,time,x,y,z", comments="", fmt="%.15g")
+    comm.Barrier()
+    return folder
+
+
+def scene_of(comm, folder, text, name="mine.toml"):
+    if comm.rank == 0:
+        (folder / name).write_text(text)
+    comm.Barrier()
+    return load_scene(folder / name)
+
+
+def relative(found, true):
+    return np.linalg.norm(found - true) / np.linalg.norm(true)
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_ground_truth_of_tracks_is_that_of_the_flow(comm, twin, tmp_path):
+    scene = tracks.with_tracks(scene_of(comm, tmp_path, SECTION.format(
+        path=twin / "tracks.csv", unit=MILLISECONDS)), comm)
+    tracks.run(scene, comm, tmp_path)
+    with h5py.File(tmp_path / "ground_truth.h5") as own, h5py.File(twin / "ground_truth.h5") as true:
+        assert own["particles/tracers/position/value"].shape[1] == scene.tracers.particles == 980
+        assert own["tracks"].attrs["in_file"] == 1000
+        np.testing.assert_allclose(own["particles/tracers/position/time"], true["particles/tracers/position/time"])
+        for name, error in (("position", 1e-6), ("velocity", 0.02)):
+            place = f"particles/tracers/{name}/value"
+            assert relative(own[place][()], true[place][:, 20:]) < error
+        times = np.round(true["fields/filtered/time"][()], 9)
+        for time, field in zip(own["fields/filtered/time"][()], own["fields/filtered/velocity"][()]):
+            truth = true["fields/filtered/velocity"][int(np.flatnonzero(times == np.round(time, 9))[0])]
+            assert relative(field, truth) < 0.1
+        for name in ("acceleration_rms", "velocity_rms", "eddy_turnover_time"):
+            assert own["reference"].attrs[name] == pytest.approx(true["reference"].attrs[name], rel=0.1)
+
+
+@pytest.mark.mpi(1)
+def test_noise_costs_less_with_smoothing(comm, twin, tmp_path):
+    rows = np.loadtxt(twin / "tracks.csv", delimiter=",", skiprows=1)
+    noise = 0.005 * MILLIMETRES / 10  # a two-hundredth of the mean spacing, and half of a displacement
+    rows[:, 2:] = (rows[:, 2:] + noise * np.random.default_rng(2).standard_normal(rows[:, 2:].shape)) % MILLIMETRES
+    np.savetxt(tmp_path / "noisy.csv", rows, delimiter=",", header="track,time,x,y,z", comments="", fmt="%.15g")
+    with h5py.File(twin / "ground_truth.h5") as file:
+        true = file["particles/tracers/velocity/value"][:, 20:]
+    errors = {}
+    for given in (0.0, noise):
+        scene = scene_of(comm, tmp_path, SECTION.format(path="noisy.csv", unit=MILLISECONDS) + f"noise = {given}\n")
+        found = tracks.measured(scene.tracks)
+        errors[given] = relative(found.columns["velocity"], true)
+    assert errors[noise] < 0.2 < 0.4 * errors[0.0]
+
+
+@pytest.mark.mpi(1)
+def test_densities_make_a_compressible_ground_truth(comm, tmp_path, twin):
+    with h5py.File(twin / "ground_truth.h5") as file:
+        arrays = {name: file[f"particles/tracers/{column}/value"][()] for name, column in ARRAYS.items()}
+        true = dict(file["reference"].attrs)
+    np.savez(tmp_path / "own.npz", **arrays)
+    scene = scene_of(comm, tmp_path, f"""[tracks]
+path = "{tmp_path / 'own.npz'}"
+interval = 0.02
+filtered = true
+box = {2 * np.pi}
+sound_speed = 15.0
+""")
+    scene = tracks.with_tracks(scene, comm)
+    tracks.run(scene, comm, tmp_path)
+    with h5py.File(tmp_path / "ground_truth.h5") as file:
+        found = dict(file["reference"].attrs)
+    for name in ("density_rms", "density_rate_rms", "velocity_rms", "acceleration_rms", "mach_turbulent"):
+        assert found[name] == pytest.approx(true[name], rel=0.05), name
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("text, error, words", [
+    (SECTION, ProductError, "missing.csv: no such file"),
+    (SECTION.replace("20.0", "19.0"), ProductError, "outside the box from 0 to 19"),
+    (SECTION.replace("box = 20.0", ""), SceneError, "box: this key is missing"),
+    (SECTION + "sound_speed = 5.0", SceneError, "has no densities"),
+    (SECTION.replace("true", "false") + "[kernel]\nsteps = 1", SceneError, "filtered = false: models are those of"),
+    (SECTION + "[forcing]\ninjection_rate = 1", SceneError, "takes the place of this section"),
+    (SECTION + "[tracers]\ncount = 500\nturnovers = 1\nframe_interval = 1", SceneError, r"\[tracers\]: does not fit"),
+    (SECTION + '[model]\npreset = "resolved"\n[training]\nframes = 2\nbatch = 10\nsteps = 1', SceneError,
+     'viscosity: this key is missing, and the term "viscosity" needs it')],
+    ids=["file", "outside", "box", "density", "filtered", "forcing", "tracers", "viscosity"])
+def test_tracks_that_do_not_fit_are_refused(comm, twin, tmp_path, text, error, words):
+    path = "missing.csv" if "missing" in words and "file" in words else twin / "tracks.csv"
+    with pytest.raises(error, match=words) as caught:
+        tracks.with_tracks(scene_of(comm, tmp_path, text.format(path=path, unit=MILLISECONDS)), comm)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.mpi(1)
+def test_layouts_of_the_scene_are_those_that_can_be_read():
+    from eddies.io.track_files import LAYOUTS
+    from eddies.scene.sections import Tracks
+    assert Tracks.__dataclass_fields__["format"].metadata["rule"].words == tuple(LAYOUTS)
+
+
+@pytest.mark.mpi(1)
+def test_data_as_published_are_trained_on_end_to_end(comm, tmp_path, no_figures, quick_spectra):
+    """16^3 particles in arrays pos, vel and rho, the published system, and the measures of Fig. 3."""
+    prepared(comm, tmp_path / "flow", overrides=[
+        "tracers.particles_per_side=16", "flow.cells=24", "tracers.field_cells=24", "tracers.turnovers=0.2"])
+    with h5py.File(tmp_path / "flow/ground_truth.h5") as file:
+        np.savez(tmp_path / "published.npz", **{
+            name: file[f"particles/tracers/{column}/value"][()] for name, column in ARRAYS.items()})
+    scene = scene_of(comm, tmp_path, f"""[tracks]
+path = "published.npz"
+interval = 0.02
+filtered = true
+box = {2 * np.pi}
+sound_speed = 15.0
+field_every = 2
+[model]
+preset = "paper"
+[training]
+window = 0.6
+frames = 2
+batch = 500
+steps = 60
+learning_rate = 1e-2
+""", "published.toml")
+    run(scene, output=tmp_path / "run", comm=comm)
+    stored = open_run(tmp_path / "run")
+    errors = stored["model/a_priori"]
+    assert np.all(np.asarray(errors["acceleration_error"]) < 0.95)  # without a model it is 1
+    assert np.asarray(errors["delay"])[-1] > 0
+    assert stored.metrics["model"]["acceleration_error"] == pytest.approx(float(errors["acceleration_error"][-1]))
