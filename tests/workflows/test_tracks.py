@@ -4,10 +4,11 @@ import h5py
 import numpy as np
 import pytest
 
-from eddies import open_run, run
+from eddies import open_run, run, write_tracks
 from eddies.io.errors import ProductError
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import tracks
+from eddies.workflows.ground_truth.track_frames import measured
 from tests.workflows.small_rollout import prepared
 
 MILLIMETRES, MILLISECONDS = 20.0, 4.0  # edge of the box, and the time unit of the file in that of the flow
@@ -49,6 +50,7 @@ def scene_of(comm, folder, text, name="mine.toml"):
 
 
 def relative(found, true):
+    """Normalised L2 error."""
     return np.linalg.norm(found - true) / np.linalg.norm(true)
 
 
@@ -58,8 +60,8 @@ def test_a_ground_truth_of_tracks_is_that_of_the_flow(comm, twin, tmp_path):
         path=twin / "tracks.csv", unit=MILLISECONDS)), comm)
     tracks.run(scene, comm, tmp_path)
     with h5py.File(tmp_path / "ground_truth.h5") as own, h5py.File(twin / "ground_truth.h5") as true:
-        assert own["particles/tracers/position/value"].shape[1] == scene.tracers.particles == 980
-        assert own["tracks"].attrs["in_file"] == 1000
+        assert own["particles/tracers/position/value"].shape[1] == own["tracks"].attrs["complete"] == 980
+        assert own["tracks"].attrs["in_file"] == 1000 and 980 < scene.tracers.particles < 1000
         np.testing.assert_allclose(own["particles/tracers/position/time"], true["particles/tracers/position/time"])
         for name, error in (("position", 1e-6), ("velocity", 0.02)):
             place = f"particles/tracers/{name}/value"
@@ -83,8 +85,9 @@ def test_noise_costs_less_with_smoothing(comm, twin, tmp_path):
     errors = {}
     for given in (0.0, noise):
         scene = scene_of(comm, tmp_path, SECTION.format(path="noisy.csv", unit=MILLISECONDS) + f"noise = {given}\n")
-        found = tracks.measured(scene.tracks)
-        errors[given] = relative(found.columns["velocity"], true)
+        found = measured(scene.tracks)
+        velocity = np.stack([found.frame(frame, complete=True)["velocity"] for frame in range(len(found.times))])
+        errors[given] = relative(velocity, true)
     assert errors[noise] < 0.2 < 0.4 * errors[0.0]
 
 
@@ -165,3 +168,27 @@ learning_rate = 1e-2
     assert np.all(np.asarray(errors["acceleration_error"]) < 0.95)  # without a model it is 1
     assert np.asarray(errors["delay"])[-1] > 0
     assert stored.metrics["model"]["acceleration_error"] == pytest.approx(float(errors["acceleration_error"][-1]))
+
+
+@pytest.mark.mpi(1, 2)
+def test_short_tracks_of_the_whole_flow_have_filtered_fields(comm, tmp_path):
+    """No track is there all the time, and all follow the whole flow; the filter is applied to the reconstruction."""
+    prepared(comm, tmp_path / "flow", removals=["kernel", "model", "training", "simulation"], overrides=[
+        "tracers.particles_per_side=14", "flow.cells=16", "tracers.field_cells=16", "tracers.filtered=false",
+        "tracers.filter_width=1.2"])
+    if comm.rank == 0:
+        with h5py.File(tmp_path / "flow/ground_truth.h5") as file:
+            times, position, velocity = (file[f"particles/tracers/{name}"][()] for name in (
+                "position/time", "position/value", "velocity/value"))
+        frame, particle = (part.ravel() for part in np.meshgrid(*map(np.arange, position.shape[:2]), indexing="ij"))
+        there = (frame < len(times) - 1) ^ (particle % 2 == 0)
+        write_tracks(tmp_path / "short.h5", times[frame[there]], particle[there], position[frame, particle][there],
+                     velocity[frame, particle][there])
+    scene = tracks.with_tracks(scene_of(comm, tmp_path, '[tracks]\npath = "short.h5"\nfield_every = 2\n'
+                                        'filter_width = 1.2\n'), comm)
+    tracks.run(scene, comm, tmp_path)
+    with h5py.File(tmp_path / "ground_truth.h5") as own, h5py.File(tmp_path / "flow/ground_truth.h5") as true:
+        assert "particles" not in own and own["tracks"].attrs["complete"] == 0
+        field, truth = own["fields/filtered/velocity"][0], true["fields/filtered/velocity"][0]
+        assert own["reference"].attrs["energy"] == pytest.approx(true["reference"].attrs["energy"], rel=0.15)
+    assert relative(field, truth) < 0.1

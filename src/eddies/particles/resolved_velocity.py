@@ -178,7 +178,7 @@ class ResolvedVelocity:
 
     @classmethod
     def on_slabs(cls, decomposition: SlabDecomposition, flow: FlowUnits, margin: float = 0.0,
-                 dtype: torch.dtype | None = None) -> ResolvedVelocity:
+                 dtype: torch.dtype | None = None, weight: float = WEIGHT) -> ResolvedVelocity:
         """On a grid with one cell for each plane of the slabs, in double precision by default.
 
         Particles may be outside their slab by `margin` at most.
@@ -189,7 +189,7 @@ class ResolvedVelocity:
         resolved = min(max(shells, 1), (decomposition.planes - 1) // 2)
         planes = max(math.ceil(margin / decomposition.spacing - 1e-9), 1)
         grid = FourierGrid(decomposition, resolved, planes, dtype or torch.float64)
-        return cls(grid, scales.filter_width, scales.kolmogorov_length)
+        return cls(grid, scales.filter_width, scales.kolmogorov_length, weight)
 
     def of(self, particles: ParticleSet, time: float | None = None, near: Tensor | None = None) -> ResolvedFlow:
         """The resolved flow of particles.

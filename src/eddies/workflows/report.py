@@ -55,9 +55,9 @@ ROLLOUT_COST = {"seconds_per_step": "rollout: seconds of a step (median, without
                 "particles": "particles of the rollout",
                 "ranks": "ranks of the rollout"}
 SIMULATION = "dns_seconds_per_turnover"
-SOURCE_OF_TRACKS = ("{count} measured tracks of {file}, those of {in_file} that are there in all frames. Fields are "
-                    "reconstructed from them by least squares. The dissipation rate is that of the literature for this "
-                    "velocity and integral scale.")
+SOURCE_OF_TRACKS = ("{in_file} measured tracks of {file}, {mean_count:.0f} at a time; {complete} are there in all "
+                    "frames. Fields are reconstructed from them by least squares. The dissipation rate is that of the "
+                    "literature for this velocity and integral scale.")
 MAIN_PAGE = 3  # the main page takes as long as this many other pages; so does a round of pages
 Row = dict[str, Any]
 
@@ -327,7 +327,7 @@ def _ground_truth_sections(file: File) -> list[Section]:
     source = {}
     if "tracks" in file:
         about = read_attributes(file, "tracks")
-        source = {"source": SOURCE_OF_TRACKS.format(count=file["particles/tracers/id"].shape[0], **about)}
+        source = {"source": SOURCE_OF_TRACKS.format(**about)}
     sections = [ground_truth.section(statistics, spectra, reference, planes, name, **source)]
     if "stationary" in file:
         try:
