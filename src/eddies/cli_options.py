@@ -16,6 +16,7 @@ from eddies.pipeline import STAGES
 EXAMPLES = {
     "run": ("eddies run hit-small", "mpirun -n 2 eddies run mine.toml --set training.steps=200 --output runs/second"),
     "dns": ("eddies dns hit-small --set seed=2 --output runs/hit-small-seed-2",),
+    "reconstruct": ("eddies reconstruct tiny --set reconstruction.method=memory",),
     "train-kernel": ("eddies train-kernel hit-small --set kernel.steps=500",),
     "train": ("eddies train hit-small", "eddies train hit-mt016 --set model.path=runs/hit"),
     "find-step": ("eddies find-step hit-small --set simulation.integrator=verlet",),

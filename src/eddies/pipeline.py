@@ -42,6 +42,8 @@ STAGES = {stage.name: stage for stage in (
           (), "checkpoints"),
     Stage("train-kernel", "the smoothing kernel", "kernel", "kernel", ("kernel", "window"),
           ("dns",), "checkpoints-kernel", but=("kernel.form",)),
+    Stage("reconstruct", "velocity, gradient, pressure and acceleration of each frame, from particle tracks",
+          "reconstruction", "reconstruction", ("reconstruction",), ("dns", "train-kernel"), None),
     Stage("train", "the model of the particles", "model", "model",
           ("device", "model", "weights", "training", "truths", "own_model"),
           ("dns", "train-kernel"), "checkpoints-train"),
@@ -52,7 +54,7 @@ STAGES = {stage.name: stage for stage in (
           ("device", "simulation", "found_step", "window", "truths", "eulerian", "own_simulation"),
           ("dns", "train-kernel", "train", "find-step"), "checkpoints-rollout"),
     Stage("report", "figures, one page and metrics.json of a run directory", None, None,
-          (), ("dns", "train-kernel", "train", "find-step", "simulate"), None),
+          (), ("dns", "train-kernel", "reconstruct", "train", "find-step", "simulate"), None),
 )}
 #: The stage that makes each kind of product.
 MAKER_OF = {stage.product: stage for stage in STAGES.values() if stage.product is not None}

@@ -41,8 +41,8 @@ log = logging.getLogger("eddies")
 
 # The modules of the stages, imported when their stage runs: run(directory, comm, variants, stop) of the report,
 # run(scene, comm, directory, stop) of the others.
-MODULES = {"dns": "dns", "train-kernel": "train_kernel", "train": "train", "find-step": "find_step",
-           "simulate": "simulate", "report": "report"}
+MODULES = {"dns": "dns", "train-kernel": "train_kernel", "reconstruct": "reconstruct", "train": "train",
+           "find-step": "find_step", "simulate": "simulate", "report": "report"}
 
 
 class VariantsFailed(UserError):

@@ -18,7 +18,8 @@ from eddies.scene.scene import Scene, load_scene
 TRAJECTORIES = {"tracers": "ground_truth/particles/tracers", "model": "rollout/particles/model",
                 "truth": "rollout/particles/truth"}
 FIELDS = {"filtered": "ground_truth/fields/filtered", "unfiltered": "ground_truth/fields/unfiltered",
-          "final": "ground_truth/fields/final", "model": "rollout/fields/model", "truth": "rollout/fields/truth"}
+          "final": "ground_truth/fields/final", "reconstructed": "reconstruction/fields/reconstructed",
+          "model": "rollout/fields/model", "truth": "rollout/fields/truth"}
 #: Groups that are not stored, but computed from the rollout and its truth on access.
 MADE = tuple(f"rollout/{group}" for group in ("particles/truth", "gradients/model", "gradients/truth", "fields/model",
                                               "fields/truth", "spectra_of_model", "spectra_of_truth"))
@@ -143,8 +144,8 @@ class StoredRun:
     def field(self, name: str = "velocity", time: float | None = None, of: str = "filtered") -> Any:
         """A field on its grid, (component, z, y, x), at the stored time nearest to `time`, or the last.
 
-        `of` is "filtered" or "unfiltered" for the flow, "final" for a run without tracers, or "model" or "truth" for
-        the field that the kernel reconstructs from the particles.
+        `of` is "filtered" or "unfiltered" for the flow, "final" for a run without tracers, "reconstructed" for the
+        fields of [reconstruction], or "model" or "truth" for the field that the kernel makes of the particles.
         """
         return at_time(self[chosen(FIELDS, of)], name, time)
 

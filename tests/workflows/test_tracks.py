@@ -7,7 +7,7 @@ import pytest
 from eddies import open_run, run, write_tracks
 from eddies.io.errors import ProductError
 from eddies.scene.scene import SceneError, load_scene
-from eddies.workflows import tracks
+from eddies.workflows import export, tracks
 from eddies.workflows.ground_truth.track_frames import measured
 from tests.workflows.small_rollout import prepared
 
@@ -192,3 +192,32 @@ def test_short_tracks_of_the_whole_flow_have_filtered_fields(comm, tmp_path):
         field, truth = own["fields/filtered/velocity"][0], true["fields/filtered/velocity"][0]
         assert own["reference"].attrs["energy"] == pytest.approx(true["reference"].attrs["energy"], rel=0.15)
     assert relative(field, truth) < 0.1
+
+
+@pytest.mark.mpi(1)
+def test_fields_of_tracks_have_the_units_of_the_file(comm, twin, tmp_path, no_figures):
+    scene = scene_of(comm, tmp_path, SECTION.format(path=twin / "tracks.csv", unit=MILLISECONDS) + f"""
+viscosity = {0.1 * (MILLIMETRES / (2 * np.pi))**2}
+[reconstruction]
+method = "memory"
+cells = 14
+every = 2
+fields = ["velocity", "acceleration"]
+""")
+    assert scene.stages == ("dns", "reconstruct", "report")
+    run(scene, output=tmp_path / "run", comm=comm)
+    stored = open_run(tmp_path / "run")
+    assert 0 < stored.metrics["reconstruction"]["validation_error"] < 0.2
+    field = np.asarray(stored.field(of="reconstructed"))
+    with h5py.File(tmp_path / "run/reconstruction.h5") as own, h5py.File(twin / "ground_truth.h5") as true:
+        time = own["fields/reconstructed/time"][-1]
+        frame = int(np.argmin(np.abs(true["fields/filtered/time"][()] - time)))
+        assert relative(field, true["fields/filtered/velocity"][frame] * MILLIMETRES / (2 * np.pi)) < 0.15
+        acceleration, time = (own[f"fields/reconstructed/{name}"][-2] for name in ("acceleration", "time"))
+        tracers, times = true["particles/tracers/velocity/value"], true["particles/tracers/position/time"][()]
+        frame = int(np.argmin(np.abs(times - time)))
+        rates = (tracers[frame + 1] - tracers[frame - 1]) / (times[frame + 1] - times[frame - 1])
+        assert np.std(acceleration) == pytest.approx(np.std(rates) * MILLIMETRES / (2 * np.pi), rel=0.1)
+    export.run(tmp_path / "run", tmp_path / "vtk", comm)
+    with h5py.File(tmp_path / "vtk/reconstruction-fields-reconstructed.vtkhdf") as file:
+        np.testing.assert_allclose(file["VTKHDF"].attrs["Spacing"], MILLIMETRES / 14)

@@ -12,7 +12,8 @@ import h5py
 import numpy as np
 
 # The origin of the times in a product, by kind.
-BEGINNING = {"ground_truth": "since the release of the tracers", "rollout": "since the start of the rollout"}
+BEGINNING = {"ground_truth": "since the release of the tracers", "reconstruction": "since the first frame",
+             "rollout": "since the start of the rollout"}
 # Attributes of a file with a flow.
 CONVENTIONS = {
     "units": "L: edge of the cube over 2 pi; T: follows from lengths and velocities; M: so that the mean density is "
@@ -23,6 +24,7 @@ ORIGINS = {
     "ground_truth": "of particles, filtered and unfiltered fields and `spectra`: the release of the tracers, at "
                     "released_at (attribute of reference) of the simulation; of `statistics`, `stationary` and "
                     "fields/final: the start of the simulation",
+    "reconstruction": "the first frame of the tracks",
     "rollout": "the start of the rollout, at start_time (attribute of rollout) after the release of the tracers",
 }
 
@@ -48,6 +50,13 @@ QUANTITIES = {
     "particles/*/acceleration/value": Quantity("L/T^2", f"{PARTICLES} xyz", "of the particles"),
     "particles/*/density/value": Quantity("M/L^3", PARTICLES, "at the particles"),
     "gradients/*/velocity_gradient": Quantity("1/T", f"{PARTICLES} i j", "dv_i/dx_j through the kernel"),
+    "fields/reconstructed/velocity": Quantity("L/T", FIELD, f"in the units of the tracks {POINTS}"),
+    "fields/reconstructed/gradient": Quantity("1/T", FIELD, f"du_i/dx_j, row by row {POINTS}"),
+    "fields/reconstructed/vorticity": Quantity("1/T", FIELD, f"components x, y, z {POINTS}"),
+    "fields/reconstructed/q": Quantity("1/T^2", FIELD, f"-tr(A A)/2 of the gradient A {POINTS}"),
+    "fields/reconstructed/r": Quantity("1/T^3", FIELD, f"-tr(A A A)/3 of the gradient A {POINTS}"),
+    "fields/reconstructed/pressure": Quantity("L^2/T^2", FIELD, f"over the density, of mean 0 {POINTS}"),
+    "fields/reconstructed/acceleration": Quantity("L/T^2", FIELD, f"along tracks {POINTS}"),
     "fields/*/velocity": Quantity("L/T", FIELD, f"components x, y, z {POINTS}"),
     "fields/*/density": Quantity("M/L^3", FIELD, POINTS),
     "spectra*/wavenumber": Quantity("1/L", "wavenumber", "shell of the modes with this |k|, rounded"),
@@ -84,6 +93,8 @@ QUANTITIES = {
     "closure/*": Quantity("1", "time", "solves for the resolved velocity since the frame before: {name}"),
     "outside_training/time": Quantity("T", "time", "since the start of the rollout"),
     "outside_training/*": Quantity("1", "time", "share of pairs with an input of the network outside of its training"),
+    "errors_over_time/seconds": Quantity("s", "time", "wall time of the frame"),
+    "errors_over_time/*_error": Quantity("1", "time", "relative L2 error: {name}"),
     "kernels/r_over_h": Quantity("1", ROW, "distance over the support"),
     "kernels/value_*": Quantity("1", ROW, "W h^3 of the kernel {name}"),
     "kernels/derivative_*": Quantity("1", ROW, "W' h^4 of the kernel {name}"),

@@ -13,8 +13,8 @@ from eddies.report.page import Metric, Section
 GOOD, FAIR, POOR = "good", "fair", "poor"
 KEY = "verdict"
 #: Order of the sections on the page, and the sections that are not folded.
-ORDER = ("variants", KEY, "rollout", "forced", "step", "model", "kernel", "cost", "ground_truth", "stationary",
-         "tracers")
+ORDER = ("variants", KEY, "rollout", "forced", "step", "model", "reconstruction", "kernel", "cost", "ground_truth",
+         "stationary", "tracers")
 OPEN = ("variants", KEY, "rollout", "forced")
 
 # Each pair is the largest error that is good and the largest that is fair.

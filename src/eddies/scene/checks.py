@@ -166,7 +166,7 @@ def check_reach(section: str, neighbors: float, tracers: Tracers, skin: float) -
 
 def check_needs(present: Collection[str], needs_model: bool, has_weights: bool) -> Problems:
     """Missing sections that others need."""
-    needs = {"kernel": "tracers", "model": "tracers", "training": "model",
+    needs = {"kernel": "tracers", "reconstruction": "tracers", "model": "tracers", "training": "model",
              "simulation": "model" if needs_model else "tracers"}
     for name, other in needs.items():
         if name in present and other not in present:

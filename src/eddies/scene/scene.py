@@ -19,13 +19,13 @@ from eddies.scene.layers import (BUILT_IN, OF_FILES, VARIANT, Layer, check_comma
 from eddies.scene.model import Model
 from eddies.scene.rules import quoted
 from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, NEIGHBORS, Eulerian, Flow, Forcing, Horizons, Initial,
-                                   Kernel, Simulation, SpinUp, Time, Tracers, Tracks, Training)
+                                   Kernel, Reconstruction, Simulation, SpinUp, Time, Tracers, Tracks, Training)
 from eddies.scene.values import (SceneError, Section, choice, import_paths, integer, integers, place, read_section,
                                  section, sections, text, write_section)
 
 __all__ = ["BOX_LENGTH", "REALISATION", "Scene", "SceneError", "builtin_scenes", "load_scene", "Eulerian", "Flow",
-           "Forcing", "Horizons", "Initial", "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Tracks",
-           "Training"]
+           "Forcing", "Horizons", "Initial", "Kernel", "Model", "Reconstruction", "Simulation", "SpinUp", "Time",
+           "Tracers", "Tracks", "Training"]
 
 REALISATION = checks.REALISATION
 # The keys of a scene that a variant cannot change.
@@ -60,6 +60,7 @@ class Scene(Section):
     spin_up: SpinUp | None = section(SpinUp, default=None)
     tracers: Tracers | None = section(Tracers, default=None)
     kernel: Kernel | None = section(Kernel, default=None)
+    reconstruction: Reconstruction | None = section(Reconstruction, default=None)
     model: Model | None = section(Model, default=None)
     training: Training | None = section(Training, default=None)
     simulation: Simulation | None = section(Simulation, default=None)

@@ -346,6 +346,28 @@ class Kernel(Section):
                                'form = "average", or positive = true')
 
 
+#: Quantities of [reconstruction] fields, with the number of components of each.
+RECONSTRUCTED = {"velocity": 3, "gradient": 9, "vorticity": 3, "q": 1, "r": 1, "pressure": 1, "acceleration": 3}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruction(Section):
+    """Fields from the particles of each frame, on a grid."""
+
+    method: str = choice("least-squares: solenoidal modes with a prior; memory: the same with the forecast from the "
+                         "frame before as the mean; kriging, quadratic, linear: from neighbours; average: with the "
+                         "kernel, Eqs. 5 and 6", "least-squares", "memory", "kriging", "quadratic", "linear", "average",
+                         default="least-squares")
+    cells: int | None = integer("cells along each side of the grid; absent: those of the stored fields", default=None,
+                                at_least=8, at_most=MOST_CELLS)
+    every: int = integer("number of frames per reconstruction", default=1, at_least=1)
+    fields: tuple[str, ...] = texts("quantities that are stored; gradient: du_i/dx_j, row by row; q, r: its invariants",
+                                    *RECONSTRUCTED, default=("velocity", "vorticity", "pressure"))
+    holdout: float = number("share of the tracks that a second reconstruction leaves out, to estimate the error; 0: "
+                            "none", default=0.1, at_least=0, at_most=0.5)
+    memory: float = number("time for which a wave is remembered, over 1 / (k u')", default=64.0, above=0)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Horizons(Section):
     """Training through several steps of the simulation, after all other training."""

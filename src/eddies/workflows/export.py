@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from eddies.scene.sections import BOX_LENGTH
 
 log = logging.getLogger("eddies")
 
-PRODUCTS = ("ground_truth", "rollout")
+PRODUCTS = ("ground_truth", "reconstruction", "rollout")
 Provenance = Mapping[str, Any]
 Series = Mapping[str, Mapping[str, Any]]  # of fields and particles, by group and name
 
@@ -42,7 +43,8 @@ def run(run_directory: Path, output: Path, comm: Comm, layout: str = "vtkhdf") -
 
 def _export(run_directory: Path, output: Path, alone: Comm, layout: str) -> None:
     written = 0
-    for kind, opened in (("ground_truth", _ground_truth), ("rollout", _rollout)):
+    for kind, opened in (("ground_truth", partial(_stored, "ground_truth")),
+                         ("reconstruction", partial(_stored, "reconstruction")), ("rollout", _rollout)):
         if (run_directory / f"{kind}.h5").exists():
             with opened(run_directory, alone) as (series, provenance):
                 for group, name in ((group, name) for group in series for name in series[group]):
@@ -56,9 +58,9 @@ def _export(run_directory: Path, output: Path, alone: Comm, layout: str) -> None
 
 
 @contextmanager
-def _ground_truth(run_directory: Path, alone: Comm) -> Iterator[tuple[Series, Provenance]]:
-    """All series of the ground truth."""
-    with open_product(alone, run_directory / "ground_truth.h5", "ground_truth") as file:
+def _stored(kind: str, run_directory: Path, alone: Comm) -> Iterator[tuple[Series, Provenance]]:
+    """All series of a product that holds them."""
+    with open_product(alone, run_directory / f"{kind}.h5", kind) as file:
         yield {group: {name: reader(file, name) for name in file.get(group, ())}
                for group, reader in (("fields", FieldSeries), ("particles", Trajectory))}, read_provenance(file)
 
@@ -69,6 +71,13 @@ def _rollout(run_directory: Path, alone: Comm) -> Iterator[tuple[Series, Provena
     from eddies.workflows.rollout.measured import open_rollout  # torch
     with open_rollout(run_directory, alone) as measured:
         yield measured.exported, measured.provenance
+
+
+def _edge_of(series: Any) -> float:
+    """Edge of the cube: of fields reconstructed from measured tracks in their unit of length."""
+    if isinstance(series, FieldSeries) and "about" in series.file:
+        return BOX_LENGTH * float(series.file["about"].attrs["length_unit"])
+    return BOX_LENGTH
 
 
 def _write(output: Path, case: str, group: str, series: Any, provenance: Provenance, data_set: bool) -> bool:
@@ -86,7 +95,7 @@ def _write(output: Path, case: str, group: str, series: Any, provenance: Provena
     if data_set:
         write_dataset(path, series, case, provenance)
     elif group == "fields":
-        write_images(path, series, BOX_LENGTH, provenance)
+        write_images(path, series, _edge_of(series), provenance)
     else:
         write_points(path, series, provenance)
     log.info("export: %s, %d frames", path, len(series.times))

@@ -250,7 +250,7 @@ def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
     """Warnings of the stages of a step; earlier steps write the files that are `made`."""
     scene, stages, expected = step.scene, step.stages, estimate(step.scene)
     tracers, model, training, simulation = scene.tracers, scene.model, scene.own_training, scene.simulation
-    if "dns" in stages:
+    if "dns" in stages and scene.tracks is None:
         if expected.turbulence is not None:
             yield from resolution(scene.flow, expected.turbulence)
             yield from laminar_flow(scene.flow, expected.turbulence)

@@ -33,7 +33,8 @@ from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
 from eddies.pipeline import MAKER_OF
-from eddies.report import figures, forced, ground_truth, kernel, model, rollout, stationary, steps, tracers, verdict
+from eddies.report import (figures, forced, ground_truth, kernel, model, reconstruction, rollout, stationary, steps,
+                           tracers, verdict)
 from eddies.report import variants as table_of_variants
 from eddies.report.page import Metric, RunRecord, Section, shown, write_page
 from eddies.scene.scene import Scene, SceneError, load_scene
@@ -50,7 +51,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("eddies")
 
-KINDS = "ground_truth", "kernel", "model", "step", "rollout"  # products, in the order in which they are read
+#: Products, in the order in which they are read.
+KINDS = "ground_truth", "kernel", "reconstruction", "model", "step", "rollout"
 ROLLOUT_COST = {"seconds_per_step": "rollout: seconds of a step (median, without storing)",
                 "particles": "particles of the rollout",
                 "ranks": "ranks of the rollout"}
@@ -256,6 +258,8 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
         "ground_truth": _ground_truth_sections,
         "kernel": lambda file: [kernel.section(read_json(file, "description")["support"], **{
             name: read_table(file, name) for name in ("kernels", "slices", "errors")})],
+        "reconstruction": lambda file: [reconstruction.section(
+            read_attributes(file, "about"), read_table(file, "errors_over_time"), _middle_plane(file))],
         "model": lambda file: [_model_section(file, page, main)],
         "step": lambda file: [steps.section(read_attributes(file, "found"), {
             name: read_table(file, f"trials/{name}") for name in file["trials"]})],
@@ -339,6 +343,13 @@ def _ground_truth_sections(file: File) -> list[Section]:
         found = tracer_statistics(Trajectory(file, "tracers"), spectra, reference["spacing"])
         sections.append(tracers.section(found, reference, power))
     return sections
+
+
+def _middle_plane(file: File) -> np.ndarray | None:
+    """u_x in the plane z = pi of the last reconstruction; None if the velocity is not stored."""
+    series = FieldSeries(file, "reconstructed")
+    middle = series.cells // 2
+    return series.read(-1, "velocity", middle, middle + 1)[0, 0] if "velocity" in series.variables else None
 
 
 def _model_section(file: File, page: Page, main: bool) -> Section:

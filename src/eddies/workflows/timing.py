@@ -4,6 +4,7 @@ with a short ground truth of the scene's own flow, on its own grid."""
 from __future__ import annotations
 
 import logging
+import math
 import shutil
 import tempfile
 import time
@@ -27,7 +28,7 @@ from eddies.parallel.stop import Stopped, StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene, SceneError, Training
-from eddies.workflows import dns, find_step, report, simulate, train, train_kernel
+from eddies.workflows import dns, find_step, reconstruct, report, simulate, train, train_kernel
 from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.ground_truth.frame_counts import TESTED_FRAMES
 from eddies.workflows.learned.model import load_kernel
@@ -39,7 +40,8 @@ from eddies.workflows.variants import steps
 
 log = logging.getLogger("eddies")
 
-RUN = {"dns": dns.run, "train-kernel": train_kernel.run, "train": train.run, "find-step": find_step.run,
+RUN = {"dns": dns.run, "train-kernel": train_kernel.run,
+       "reconstruct": reconstruct.run, "train": train.run, "find-step": find_step.run,
        "simulate": simulate.run}
 FEW = 4                      # steps of a training, and intervals of a rollout
 A_MOMENT = 1e-9              # turnovers of a spin-up or ground truth of as few steps as possible
@@ -137,6 +139,9 @@ def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
     step = sum(usual) / len(usual)
     if stage == "dns":
         number = expected.steps
+    elif stage == "reconstruct":
+        frames = expected.frame_intervals
+        number = None if frames is None else math.ceil((frames + 1) / whole.reconstruction.every)
     elif stage == "train-kernel":
         number = 2 * whole.kernel.steps
     else:

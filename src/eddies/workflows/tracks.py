@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,29 +18,23 @@ from eddies.io.fields import FieldWriter
 from eddies.io.hdf5 import create_product, in_files, write_attributes, write_table
 from eddies.io.trajectories import TrajectoryWriter
 from eddies.parallel.communicator import Comm
-from eddies.parallel.migration import id_block, migrate
-from eddies.parallel.reduction import global_sum
+from eddies.parallel.migration import id_block
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
-from eddies.particles.exchanges import mean_over_ranks
-from eddies.particles.flow_units import FlowUnits, ReferenceScales, measured_scales
-from eddies.particles.particle_set import ParticleSet, as_numpy
-from eddies.particles.resolved_velocity import ResolvedFlow, ResolvedVelocity
+from eddies.particles.flow_units import measured_scales
+from eddies.particles.particle_set import as_numpy
+from eddies.particles.resolved_velocity import ResolvedFlow
 from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Flow, Scene, SceneError, Tracers
 from eddies.scene.sections import Eulerian, Tracks
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.workflows.ground_truth.track_frames import TrackFrames, measured
 from eddies.workflows.run_directory.fingerprints import stage_provenance
+from eddies.workflows.track_solver import NO_FILTER, best_solver, particles_on, solver_of
 
 log = logging.getLogger("eddies")
 
 LEAST_TRACKS = 8        # that are there in all frames, for a model
-WEIGHTS = 10.0 ** np.arange(3, -1.1, -0.5)  # of the noise of least squares, of which cross-validation chooses one
-RISE = 1.02             # of the error of validation, at which the search ends
-HELD_OUT = 10           # a tenth of the tracks is left out for that, those with the smallest id * KNUTH modulo 2^32
-KNUTH = 2654435761
-NO_FILTER = 1e-3        # width of the filter of a whole flow, over the spacing
 INTEGRAL_SCALE = 0.2    # of the edge of the box: a guess, for estimates before the run
 ROUNDS = 20             # of the fixed point for the dissipation rate, each three times closer
 
@@ -124,11 +118,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     columns = tracks.frame(0)
     found = {"kolmogorov_length": 0.0} | reference
     for _ in range(2 if scene.flow.viscosity > 0 else 1):  # the second time with Kolmogorov's length in the prior
-        make = partial(_solver, slab, found | {"spacing": spacing, "filter_width": width})
-        errors = _validation_errors(slab, columns, make)
-        best = min(errors, key=errors.__getitem__)
-        solver = make(best)
-        flow = FrameFlow(solver.of(_particles(slab, columns)), columns, tracers)
+        make = partial(solver_of, slab, found | {"spacing": spacing, "filter_width": width})
+        solver, weight, error = best_solver(particles_on(slab, columns), make)
+        flow = FrameFlow(solver.of(particles_on(slab, columns)), columns, tracers)
         found = flow.scales(scene.flow.viscosity) | reference  # velocity_rms is that of the particles
     reference = found
     coarse = SpectralGrid(SlabDecomposition(comm, BOX_LENGTH, tracers.cells), cutoff=(tracers.cells - 1) // 2)
@@ -152,7 +144,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 continue
             columns = tracks.frame(frame)
             with torch.no_grad():
-                flow = FrameFlow(solver.of(_particles(slab, columns), near=near), columns, tracers)
+                flow = FrameFlow(solver.of(particles_on(slab, columns), near=near), columns, tracers)
             near = flow.resolved.velocity
             planes = coarse.backward(regrid(flow.grid, coarse, flow.filtered)) + flow.mean[:, None, None, None]
             fields.append(time, coarse.decomposition.start, {"velocity": planes})
@@ -167,9 +159,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         table = dict(zip(("time", "energy", "filtered"), map(np.array, zip(*spectra))))
         write_table(file, "spectra", {"wavenumber": np.arange(table["energy"].shape[1]), **table})
         write_attributes(file.create_group("tracks"), {
-            **tracks.about, "complete": complete, "mean_count": tracks.mean_count, "weight": best,
-            "validation_error": errors[best]})
-    log.debug("dns: errors of validation by weight: %s", errors)
+            **tracks.about, "complete": complete, "mean_count": tracks.mean_count, "weight": weight,
+            "validation_error": error})
     log.info("dns: %d tracks, %.0f at a time, %d in all %d frames, over %.3g T; u' = %.3g, L = %.3g",
              tracks.about["in_file"], tracks.mean_count, complete, len(times),
              times[-1] / reference["eddy_turnover_time"], math.sqrt(2 * float(spectra[0][1].sum()) / 3),
@@ -205,42 +196,3 @@ class FrameFlow:
             rate = dissipation_constant(reynolds) * speed**3 / length
             reynolds = math.sqrt(15 / (viscosity * rate)) * speed**2 if viscosity > 0 else math.inf
         return turbulence_scales(self.energy, rate, viscosity, cutoff) | {"dissipation_rate": rate}
-
-
-def _validation_errors(slab: SlabDecomposition, columns: Mapping[str, np.ndarray],
-                       make: Callable[[float], ResolvedVelocity]) -> dict[float, float]:
-    """Errors of the velocity at a tenth of the particles, which the solve leaves out, relative to the rms, by weight.
-
-    The weight of the noise depends on the filter, on the errors of measured velocities and on the number of particles,
-    none of which is known well. Weights are tried from the largest on, until the error rises by a fiftieth.
-    """
-    particles = _particles(slab, columns)
-    apart = particles.id * KNUTH % 2**32 < 2**32 // HELD_OUT
-    known, unknown = (ParticleSet(particles.id[rows], particles.position[rows], particles.velocity[rows])
-                      for rows in (~apart, apart))
-    mean = mean_over_ranks(slab.comm, known.velocity)
-    errors: dict[float, float] = {}
-    for weight in WEIGHTS.tolist():
-        solver = make(weight)
-        with torch.no_grad():
-            flow = solver.of(known)
-            values = solver.grid.at(flow.velocity, solver.grid.points(unknown.position))
-        wanted = unknown.velocity - mean
-        square, whole = global_sum(slab.comm, np.array([float((values - wanted).square().sum()),
-                                                        float(wanted.square().sum())]))
-        errors[weight] = math.sqrt(square / whole) if whole > 0 else 0.0
-        if errors[weight] > RISE * min(errors.values()):
-            break
-    return errors
-
-
-def _solver(slab: SlabDecomposition, reference: Mapping[str, float], weight: float) -> ResolvedVelocity:
-    scales = ReferenceScales(
-        velocity=reference["velocity_rms"], acceleration=reference["acceleration_rms"],
-        **{name: reference[name] for name in ("filter_width", "spacing", "density_mean", "viscosity",
-                                              "kolmogorov_length")})
-    return ResolvedVelocity.on_slabs(slab, FlowUnits(scales, cutoff=0.0, neighbors=0.0), weight=weight)
-
-
-def _particles(slab: SlabDecomposition, columns: Mapping[str, np.ndarray]) -> ParticleSet:
-    return ParticleSet.from_numpy(migrate(slab, dict(columns)))

@@ -44,6 +44,8 @@ def most_ranks(scene: Scene) -> dict[str, int]:
             if found := truth_limits(path, horizons, tracers, learned_neighbors, resolves):
                 reason = min(found, key=found.__getitem__)
                 limits[f"[training] truths: {quoted(name)}: {reason}"] = found[reason]
+    if scene.reconstruction:
+        limits[RESOLVED] = resolved_grid_ranks(tracers, 0.0)
     if scene.coarse_cells:
         # In one step particles move through as many cells as the Courant number.
         farther = math.ceil(max(scene.time.courant, MOST_COURANT * simulation.finds_step)) - 1

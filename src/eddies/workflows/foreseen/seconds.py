@@ -4,10 +4,12 @@
             + calls x (CALL + ROUNDS x (ranks - 1) x MESSAGE)
 """
 
+import math
 from itertools import pairwise
 
 from eddies.flow.navier_stokes import FLUIDS, CompressibleFluid
 from eddies.scene.scene import BOX_LENGTH, Scene
+from eddies.scene.sections import NEIGHBORS
 from eddies.scene.terms import NetworkSettings
 from eddies.time_stepping import ETDRK4, STEPPERS
 from eddies.workflows.foreseen.numbers import estimate
@@ -17,7 +19,8 @@ from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_FRA
 # point (1 + cells / CACHED times that where planes outgrow the caches), a pair, a weight of a network for a pair, an
 # evaluation or iteration without its work, a message; a stage without work.
 TRANSFORM, CACHED, PAIR, WEIGHT, CALL, MESSAGE, ROUNDS = 4e-9, 550, 2.5e-8, 6e-11, 2.5e-4, 2e-6, 4
-START = {"dns": 0.4, "train-kernel": 0.7, "train": 1.0, "find-step": 0.5, "simulate": 0.3, "report": 2.3}
+START = {"dns": 0.4, "train-kernel": 0.7, "reconstruct": 1.0, "train": 1.0, "find-step": 0.5, "simulate": 0.3,
+         "report": 2.3}
 FORM_PAIRS = {"average": 1, "linear": 5, "quadratic": 8, "kriging": 27}  # cost of a neighbour, in averages
 SEARCH, CONFIRM = 2, 0.75    # turnovers of rollouts that a search takes, and each further ground truth of it
 COLD, ITERATION = 25, 12     # iterations of a solve without a first guess; transforms of a point in each
@@ -39,6 +42,14 @@ def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
     elif stage == "train-kernel":  # twice
         calls = 2 * kernel.steps * GRADIENT
         pairs = kernel.neighbors * (kernel.steps * tracers.particles + 2 * KERNEL_FIELDS * tracers.cells**3)
+    elif stage == "reconstruct":
+        if expected.frame_intervals is None:
+            return None
+        settings = scene.reconstruction
+        calls = (1 + (settings.holdout > 0)) * math.ceil((expected.frame_intervals + 1) / settings.every)
+        transforms, pairs = calls * COLD * ITERATION * tracers.planes**3, 0.0
+        if settings.method in FORM_PAIRS:
+            transforms, pairs = 0.0, calls * NEIGHBORS * tracers.planes**3 * FORM_PAIRS[settings.method]
     elif stage == "train":
         solves = TESTED_FRAMES
         if training := scene.own_training:

@@ -11,6 +11,7 @@ from eddies.cores import threads
 from eddies.flow.history import EVERY
 from eddies.io.checkpoint import KEPT
 from eddies.scene.scene import Flow, Scene, Tracers
+from eddies.scene.sections import RECONSTRUCTED
 from eddies.spectral.fourier_passes import BLOCK_BYTES
 from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_PARTICLES, whole_cells, whole_frames
@@ -93,6 +94,11 @@ def disk(scene: Scene, stage: str) -> Disk:
     if stage == "train":         # samples of rates, and the history
         steps = scene.own_training.steps_in_all if scene.own_training else 0
         return Disk(PRODUCT_BYTES + 48 * min(tracers.particles, TESTED_PARTICLES) + 100 * steps)
+    if stage == "reconstruct":
+        settings = scene.reconstruction
+        values = sum(RECONSTRUCTED[name] for name in settings.fields) * (settings.cells or tracers.cells) ** 3
+        frames = expected.frame_intervals and math.ceil((expected.frame_intervals + 1) / settings.every)
+        return Disk(frames and PRODUCT_BYTES + 4 * frames * values)
     if stage == "simulate":
         return Disk(expected.rollout and rollout_bytes(tracers.particles, expected.rollout.intervals + 1))
     return Disk(PRODUCT_BYTES if stage == "find-step" else REPORT_BYTES)

@@ -1,0 +1,107 @@
+"""A resolved velocity with memory: the forecast from the moment before is the mean of the prior."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from eddies.parallel.reduction import global_sum
+from eddies.particles.exchanges import mean_over_ranks
+from eddies.particles.least_squares import LeastSquares
+from eddies.particles.particle_set import ParticleSet, as_numpy
+from eddies.particles.resolved_velocity import ResolvedVelocity
+
+ANGLE = 0.5  # u' k_c dt of a substep of the forecast
+
+
+@dataclass
+class RememberedVelocity:
+    """Estimates the velocity of particles from frame to frame, a filter in time.
+
+    In a time dt the forecast f of a mode loses the share 1 - beta of its worth, beta = exp(-k u' dt / 2C). The prior
+    has the mean beta f and the variance  beta^2 V + (1 - beta^2) P,  with P that of the solver and V that of the
+    estimate before, which N particles and its own prior have determined: 1/V = N/e + 1/(variance of that prior), as if
+    particles were evenly spread, e the energy that the solver expects beyond its modes. So modes that few particles
+    determine collect the information of several frames. Forecasts are those of the Navier-Stokes equations for the
+    modes of the solver, of the velocity before the filter.
+
+    Parameters
+    ----------
+    solver : of the first frame, which has no forecast; its grid, prior and tolerance.
+    viscosity : nu. transfer : G of the filter that the particles follow, (kz, ky, kx); 1 for a whole flow.
+    memory : C. weight : factor of the noise in the solver, sigma^2 / e; at least 1 counts here.
+
+    All methods are collective.
+    """
+
+    solver: ResolvedVelocity
+    viscosity: float
+    transfer: Tensor
+    memory: float
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        self._latest: tuple[float, Tensor, np.ndarray] | None = None
+        self._penalty = self.solver.equations.penalty  # sigma^2 over the variance of the latest prior
+        self._count = 0.0
+
+    @torch.no_grad()
+    def of(self, particles: ParticleSet, time: float) -> Tensor:
+        """The modes (3, kz, ky, kx) of the particles' velocity, relative to its mean, at a time later than before."""
+        grid, comm = self.solver.grid, self.solver.grid.decomposition.comm
+        mean = mean_over_ranks(comm, particles.velocity)
+        relative = particles.velocity - mean
+        count, square = global_sum(comm, np.array([len(relative), float(relative.square().sum())]))
+        if self._latest is None:
+            modes = self.solver.of(particles).velocity
+        else:
+            before, latest, drift = self._latest
+            step = time - before
+            turn = step * grid.wavenumber_squared.sqrt() * self._speed(latest / self.transfer)
+            worth, points = torch.exp(-turn / (2 * self.memory)), grid.points(particles.position)
+            self._penalty = self._next_penalty(worth)
+            equations = LeastSquares(grid, self.solver.equations.inside, self._penalty)
+            prior = worth * self.solver.carried(self.forecast(latest, step), step, drift)
+            missing = relative - grid.at(prior, points)
+            right = equations.descent(missing, points, torch.zeros_like(prior))
+            change = equations.solve(points, right, count, self.solver.tolerance**2 * square, None,
+                                     self.solver.most_iterations)
+            modes = prior + change.modes
+        self._latest, self._count = (time, modes, as_numpy(mean)), count
+        return modes
+
+    def forecast(self, modes: Tensor, step: float) -> Tensor:
+        """The modes after a time, by Runge-Kutta steps of fourth order."""
+        whole = modes / self.transfer
+        highest = self.solver.grid.resolved * 2 * math.pi / self.solver.grid.decomposition.length
+        steps = max(math.ceil(step * highest * self._speed(whole) / ANGLE), 1)
+        dt = step / steps
+        for _ in range(steps):
+            first = self._change(whole)
+            second = self._change(whole + dt / 2 * first)
+            third = self._change(whole + dt / 2 * second)
+            whole = whole + dt / 6 * (first + 2 * (second + third) + self._change(whole + dt * third))
+        return whole * self.transfer
+
+    def _change(self, whole: Tensor) -> Tensor:
+        """du/dt = P[-div(uu)] + nu laplacian u of the modes that are resolved."""
+        grid, equations = self.solver.grid, self.solver.equations
+        return -equations.projected(grid.stress_divergence(grid.squares(whole))) \
+            - self.viscosity * grid.wavenumber_squared * whole
+
+    def _next_penalty(self, worth: Tensor) -> Tensor:
+        """sigma^2 over the variance of the next prior."""
+        first, inside = self.solver.equations.penalty, self.solver.equations.inside
+        before = max(self.weight, 1.0) * self._count + self._penalty
+        variance = worth**2 / before + (1 - worth**2) / torch.where(inside, first, 1.0)
+        return torch.where(inside, 1 / variance, 0.0)
+
+    def _speed(self, modes: Tensor) -> float:
+        """The rms u' of a component; collective."""
+        grid = self.solver.grid
+        square = grid.multiplicity * (modes.real.square() + modes.imag.square()).sum(0)
+        return math.sqrt(float(global_sum(grid.decomposition.comm, float(square.sum(dtype=torch.float64)))) / 3)

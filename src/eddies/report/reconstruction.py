@@ -1,0 +1,56 @@
+"""The section on fields reconstructed from tracks: errors over time, where they can be known, and the last plane."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from eddies.report.figures import (BAR, DNS, MODEL, SIGNED, TRUTH, colour_bar, largest, letter, panels, show_plane,
+                                   styled)
+from eddies.report.page import Metric, Section
+
+ERRORS = {  # column of the table: label, colour, line style
+    "validation_error": ("velocity at tracks left out", MODEL, "--"),
+    "velocity_error": ("velocity field", TRUTH, "-"),
+    "gradient_error": ("velocity gradient", DNS, ":")}
+
+
+def section(about: Mapping[str, float | str], errors: Mapping[str, np.ndarray], plane: np.ndarray | None) -> Section:
+    """Return the section from the tables of the product; `plane` is u_x [y, x] at z = pi of the last frame."""
+    means = {name: float(np.nanmean(errors[name])) if name in errors and np.isfinite(errors[name]).any() else None
+             for name in ERRORS}
+    metrics = [Metric("reconstruction_method", "method", about["method"]),
+               Metric("particles_of_a_frame", "particles of a frame", about["particles"]),
+               *(Metric(name, f"error of the {label}, mean over time (normalised L2)", means[name],
+                        "the true field is not known" if name != "validation_error" else "no track was left out")
+                 for name, (label, _, _) in ERRORS.items()),
+               Metric("seconds_per_frame", "seconds of a frame (median)", float(np.median(errors["seconds"])))]
+    shown = Section(
+        "reconstruction", "Reconstruction", f"Fields of {len(errors['time'])} frames from the velocities of "
+        f"{about['particles']:.0f} particles, by {about['method']}, up to wavenumber {about['highest_wavenumber']}. "
+        f"A second reconstruction leaves out {about['holdout']:.0%} of the tracks; its error there estimates that of "
+        "the field.", metrics=metrics, main=("validation_error", "velocity_error", "gradient_error"))
+    shown.add_figure("reconstruction", "Reconstructed fields", overview(errors, plane),
+                     "Normalised L2 errors over time" + (", and u_x in the plane z = π of the last frame." if plane
+                                                         is not None else "."))
+    return shown
+
+
+@styled
+def overview(errors: Mapping[str, np.ndarray], plane: np.ndarray | None) -> Figure:
+    """Draw errors over time, and a plane of u_x if there is one."""
+    figure, axes = panels(1, 1 if plane is None else 2, (4.4, 3.3), right=BAR)
+    over_time = axes[0, 0]
+    for name, (label, colour, style) in ERRORS.items():
+        if name in errors and (known := np.isfinite(errors[name])).any():
+            over_time.plot(errors["time"][known], errors[name][known], color=colour, linestyle=style, label=label)
+    over_time.set(title="Errors", xlabel="time $t$", ylabel="normalised L2", ylim=(0, None))
+    if over_time.lines:
+        over_time.legend()
+    if plane is not None:
+        limit = largest(plane)
+        image = show_plane(axes[0, 1], plane, (-limit, limit), SIGNED)
+        axes[0, 1].set(title="$u_x$", xlabel="$x$", ylabel="$y$")
+        colour_bar(figure, image, axes[0, 1:], "$u_x$")
+    letter(axes.flat)
+    return figure

@@ -1,0 +1,96 @@
+"""Fields from tracks: exact derivatives of a known flow, errors that are estimated well, and methods."""
+
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.fourier_grid import FourierGrid
+from eddies.scene.scene import Reconstruction
+from eddies.scene.sections import RECONSTRUCTED
+from eddies.spectral.spectral_grid import SpectralGrid
+from eddies.workflows import reconstruct
+from tests.workflows.small_rollout import prepared
+
+# The largest error of each; the flow has most of its energy near the filter.
+METHODS = {"least-squares": 0.1, "memory": 0.1, "kriging": 0.1, "quadratic": 0.15, "linear": 0.35, "average": 0.35}
+
+
+@pytest.mark.mpi(1, 2)
+def test_quantities_of_a_taylor_green_vortex_are_exact(comm):
+    """u = (sin x cos y, -cos x sin y, 0) + U with p = (cos 2x + cos 2y)/4, in another unit of length."""
+    grid = FourierGrid(SlabDecomposition(comm, 2 * np.pi, 16), 5, 1)
+    target = SpectralGrid(SlabDecomposition(comm, 2 * np.pi, 12), cutoff=5)
+
+    def points(slab):
+        axis = np.arange(slab.planes) * slab.spacing
+        z, y, x = np.meshgrid(axis[slab.start:slab.stop], axis, axis, indexing="ij")
+        return x, y, z
+
+    x, y, z = points(grid.decomposition)
+    field = np.stack([np.sin(x) * np.cos(y), -np.cos(x) * np.sin(y), 0 * z])
+    mean, unit, viscosity = np.array([0.5, 0.0, -1.0]), 3.0, 0.1
+    found = reconstruct.quantities(grid.to_modes(torch.from_numpy(field)), mean, torch.ones_like(grid.shell), viscosity,
+                                   grid, target, tuple(RECONSTRUCTED), unit)
+    x, y, z = points(target.decomposition)
+    sx, cx, sy, cy, zero = np.sin(x), np.cos(x), np.sin(y), np.cos(y), 0 * z
+    slope = np.zeros((3, 3, *x.shape))
+    slope[0, 0], slope[0, 1], slope[1, 0], slope[1, 1] = cx * cy, -sx * sy, sx * sy, -cx * cy
+    exact = {"velocity": unit * (np.stack([sx * cy, -cx * sy, zero]) + mean[:, None, None, None]),
+             "gradient": slope.reshape(9, *x.shape), "vorticity": np.stack([zero, zero, 2 * sx * sy]),
+             "q": (-(cx * cy) ** 2 + (sx * sy) ** 2)[None], "r": zero[None],
+             "pressure": unit**2 * (np.cos(2 * x) + np.cos(2 * y))[None] / 4,
+             "acceleration": unit * np.stack([sx * cx - 2 * viscosity * sx * cy, sy * cy + 2 * viscosity * cx * sy,
+                                              zero])}
+    for name, values in exact.items():
+        np.testing.assert_allclose(found[name], values, atol=1e-12, err_msg=name)
+
+
+@pytest.fixture(scope="session")
+def flow(comm, shared_folder):
+    """A scene and a folder with its ground truth: 14^3 tracers of the filtered flow, and fields."""
+    folder = shared_folder()
+    scene = prepared(comm, folder, removals=["model", "training", "simulation"], overrides=[
+        "tracers.particles_per_side=14", "flow.cells=24", "tracers.field_cells=20", "tracers.turnovers=0.3"])
+    return scene, folder
+
+
+def errors_of(comm, flow, tmp_path, linked, **keys):
+    """The errors of a reconstruction, by name, mean over time."""
+    scene, folder = flow
+    linked(folder)
+    reconstruct.run(replace(scene, reconstruction=Reconstruction(**keys)), comm, tmp_path)
+    with h5py.File(tmp_path / "reconstruction.h5") as file:
+        return {name: float(np.nanmean(values[()])) for name, values in file["errors_over_time"].items()}, {
+            name: values.shape for name, values in file["fields/reconstructed"].items()}
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("method", METHODS)
+def test_validation_estimates_the_true_error(comm, flow, tmp_path, linked, method):
+    errors, shapes = errors_of(comm, flow, tmp_path, linked, method=method, every=2, fields=("velocity", "q"))
+    assert errors["velocity_error"] < METHODS[method]
+    # Tracks that are left out have fewer neighbours, so their error is somewhat larger.
+    assert 0.7 < errors["validation_error"] / errors["velocity_error"] < 1.6
+    assert shapes["velocity"][1:] == (3, 20, 20, 20) and shapes["q"][1:] == (1, 20, 20, 20)
+
+
+@pytest.mark.mpi(2, 3)
+def test_fields_do_not_depend_on_the_number_of_ranks(comm, flow, tmp_path, linked):
+    errors, _ = errors_of(comm, flow, tmp_path, linked, method="memory", fields=("velocity",))
+    alone = comm.Split(comm.rank)
+    if comm.rank == 0:
+        scene, folder = flow
+        (tmp_path / "one").mkdir()
+        (tmp_path / "one/ground_truth.h5").symlink_to(folder / "ground_truth.h5")
+        reconstruct.run(replace(scene, reconstruction=Reconstruction(method="memory", fields=("velocity",))), alone,
+                        tmp_path / "one")
+        with h5py.File(tmp_path / "one/reconstruction.h5") as one, h5py.File(tmp_path / "reconstruction.h5") as many:
+            first, second = (file["fields/reconstructed/velocity"][()] for file in (one, many))
+        # Solves end at 2e-4 of the velocities, after as many iterations; sums have another order.
+        np.testing.assert_allclose(first, second, atol=1e-4)
+    comm.Barrier()
+    assert errors["velocity_error"] < 0.1
