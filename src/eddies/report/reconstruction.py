@@ -15,10 +15,16 @@ ERRORS = {  # column of the table: label, colour, line style
     "gradient_error": ("velocity gradient", DNS, ":")}
 
 
-def section(about: Mapping[str, float | str], errors: Mapping[str, np.ndarray], plane: np.ndarray | None) -> Section:
-    """Return the section from the tables of the product; `plane` is u_x [y, x] at z = pi of the last frame."""
-    means = {name: float(np.nanmean(errors[name])) if name in errors and np.isfinite(errors[name]).any() else None
-             for name in ERRORS}
+def section(about: Mapping[str, float | str], errors: Mapping[str, np.ndarray], of_fields: Mapping[str, np.ndarray],
+            plane: np.ndarray | None) -> Section:
+    """Return the section from the tables of the product.
+
+    errors: at tracks left out. of_fields: where the true fields are known; may be empty. plane: u_x [y, x] at z = pi of
+    the last frame.
+    """
+    both = {**{name: (of_fields["time"], of_fields[name]) for name in of_fields if name in ERRORS},
+            **{name: (errors["time"], errors[name]) for name in errors if name in ERRORS}}
+    means = {name: float(np.mean(both[name][1])) if name in both else None for name in ERRORS}
     metrics = [Metric("reconstruction_method", "method", about["method"]),
                Metric("particles_of_a_frame", "particles of a frame", about["particles"]),
                *(Metric(name, f"error of the {label}, mean over time (normalised L2)", means[name],
@@ -30,20 +36,20 @@ def section(about: Mapping[str, float | str], errors: Mapping[str, np.ndarray], 
         f"{about['particles']:.0f} particles, by {about['method']}, up to wavenumber {about['highest_wavenumber']}. "
         f"A second reconstruction leaves out {about['holdout']:.0%} of the tracks; its error there estimates that of "
         "the field.", metrics=metrics, main=("validation_error", "velocity_error", "gradient_error"))
-    shown.add_figure("reconstruction", "Reconstructed fields", overview(errors, plane),
+    shown.add_figure("reconstruction", "Reconstructed fields", overview(both, plane),
                      "Normalised L2 errors over time" + (", and u_x in the plane z = π of the last frame." if plane
                                                          is not None else "."))
     return shown
 
 
 @styled
-def overview(errors: Mapping[str, np.ndarray], plane: np.ndarray | None) -> Figure:
-    """Draw errors over time, and a plane of u_x if there is one."""
+def overview(errors: Mapping[str, tuple[np.ndarray, np.ndarray]], plane: np.ndarray | None) -> Figure:
+    """Draw errors over time, pairs of times and values by name, and a plane of u_x if there is one."""
     figure, axes = panels(1, 1 if plane is None else 2, (4.4, 3.3), right=BAR)
     over_time = axes[0, 0]
     for name, (label, colour, style) in ERRORS.items():
-        if name in errors and (known := np.isfinite(errors[name])).any():
-            over_time.plot(errors["time"][known], errors[name][known], color=colour, linestyle=style, label=label)
+        if name in errors:
+            over_time.plot(*errors[name], color=colour, linestyle=style, label=label)
     over_time.set(title="Errors", xlabel="time $t$", ylabel="normalised L2", ylim=(0, None))
     if over_time.lines:
         over_time.legend()

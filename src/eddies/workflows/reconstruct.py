@@ -121,6 +121,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         target = SpectralGrid(SlabDecomposition(comm, BOX_LENGTH, cells), cutoff=(cells - 1) // 2)
         progress = ProgressLine("reconstruct", lambda: settings.method, unit="frame")
         rows: list[dict[str, float]] = []
+        compared: list[dict[str, float]] = []
         with create_product(comm, directory / STAGES["reconstruct"].file, "reconstruction",
                             stage_provenance(scene, "reconstruct")) as file:
             writer = FieldWriter(file, "reconstructed", cells, {name: RECONSTRUCTED[name] for name in settings.fields})
@@ -137,18 +138,20 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                     known, apart = split(now, settings.holdout)
                     row["validation_error"] = validation_error(solver, methods[1].of(known, float(times[frame])), known,
                                                                apart)
-                if truth is not None:
-                    row |= errors_of(modes, mean, tracers.filtered, tracers.filter_width, grid, truth, frame)
                 rows.append(row)
+                if truth is not None and frame in truth.at_fields:
+                    compared.append({"time": row["time"], **errors_of(
+                        modes, mean, tracers.filtered, tracers.filter_width, grid, truth, frame)})
                 progress((number + 1) / len(frames), number + 1)
-            columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in dict.fromkeys(
-                name for row in rows for name in row)}
-            write_table(file, "errors_over_time", columns)
+            for name, table in (("errors_over_time", rows), ("errors_of_fields", compared)):
+                if table:
+                    write_table(file, name, {key: np.array([row[key] for row in table]) for key in table[0]})
             write_attributes(file.create_group("about"), {
                 "method": settings.method, "particles": float(count), "weight": weight, "length_unit": unit,
                 "holdout": settings.holdout, "highest_wavenumber": grid.resolved})
-    log.info("reconstruct: %s, %s", settings.method, ", ".join(
-        f"{name.replace('_', ' ')} {np.nanmean(values):.3g}" for name, values in columns.items() if name != "time"))
+    log.info("reconstruct: %s; means over time: %s", settings.method, ", ".join(
+        f"{key.replace('_', ' ')} {np.mean([row[key] for row in table]):.3g}"
+        for table in (rows, compared) if table for key in table[0] if key != "time"))
 
 
 def _maker(scene: Scene, comm: Comm, directory: Path, solver: ResolvedVelocity, weight: float,
@@ -199,9 +202,7 @@ def quantities(modes: Tensor, mean: np.ndarray, transfer: Tensor, viscosity: flo
 
 def errors_of(modes: Tensor, mean: np.ndarray, filtered: bool, filter_width: float, grid: FourierGrid,
               truth: GroundTruth, frame: int) -> Mapping[str, float]:
-    """Normalised L2 errors of filtered velocity and its gradient, where the ground truth has the field of a frame."""
-    if frame not in truth.at_fields:
-        return {}
+    """Normalised L2 errors of the filtered velocity and its gradient at a frame whose field the ground truth has."""
     slab = SlabDecomposition(grid.decomposition.comm, BOX_LENGTH, truth.fields.cells)
     target = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
     exact = truth.planes(truth.fields, truth.at_fields.index(frame), "velocity", slab)

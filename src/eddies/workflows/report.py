@@ -259,7 +259,8 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
         "kernel": lambda file: [kernel.section(read_json(file, "description")["support"], **{
             name: read_table(file, name) for name in ("kernels", "slices", "errors")})],
         "reconstruction": lambda file: [reconstruction.section(
-            read_attributes(file, "about"), read_table(file, "errors_over_time"), _middle_plane(file))],
+            read_attributes(file, "about"), read_table(file, "errors_over_time"),
+            read_table(file, "errors_of_fields") if "errors_of_fields" in file else {}, _middle_plane(file))],
         "model": lambda file: [_model_section(file, page, main)],
         "step": lambda file: [steps.section(read_attributes(file, "found"), {
             name: read_table(file, f"trials/{name}") for name in file["trials"]})],

@@ -25,7 +25,7 @@ from eddies.scene.scene import REALISATION, Scene
 from eddies.workflows.run_directory.fingerprints import set_files, stage_fingerprint
 
 # Stages whose products variants share if their settings agree.
-SHARED = ("dns", "train-kernel")
+SHARED = ("dns", "train-kernel", "reconstruct")
 # Stages that make a product.
 MAKING = tuple(stage.name for stage in STAGES.values() if stage.product is not None)
 
