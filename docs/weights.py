@@ -22,7 +22,7 @@ def keep(run: Path, name: str) -> Path:
     description, weights = load_weights(comm, source, "model")
     with open_product(comm, source, "model") as file:
         provenance = read_provenance(file)
-    tables = {name: table for name, table in load_tables(source).items() if name in KEPT}
+    tables = {name: table for name, table in load_tables(comm, source).items() if name in KEPT}
     target = WEIGHTS / f"{name}.h5"
     save_weights(comm, target, "model", description, weights, provenance, tables)
     return target
