@@ -45,7 +45,7 @@ def test_fields_survive(comm, tmp_path, monkeypatch):
     """At any step, in any order; with the planes that close the periodic cube, copied in several parts."""
     monkeypatch.setattr(vtkhdf, "BLOCK_BYTES", 1000)
     with product(comm, tmp_path) as file:
-        vtkhdf.write_images(tmp_path / "new" / "f.vtkhdf", FieldSeries(file, "filtered"), LENGTH, {})
+        vtkhdf.write_images(tmp_path / "new" / "f.vtkhdf", FieldSeries(file, "filtered"), LENGTH, np.zeros(3), {})
     read = VtkFile(tmp_path / "new" / "f.vtkhdf")
     assert read.times == TIMES
     for frame in (2, 0, 1):
@@ -66,7 +66,7 @@ def test_components_and_axes_are_not_swapped(comm, tmp_path):
     with create_product(comm, tmp_path / "p.h5", "ground_truth", {}) as file:
         FieldWriter(file, "final", CELLS, {"velocity": 3}).append(0.0, 0, {"velocity": np.stack([x, 2 * y, 3 * z])})
     with open_product(comm, tmp_path / "p.h5", "ground_truth") as file:
-        vtkhdf.write_images(tmp_path / "f.vtkhdf", FieldSeries(file, "final"), LENGTH, {})
+        vtkhdf.write_images(tmp_path / "f.vtkhdf", FieldSeries(file, "final"), LENGTH, np.zeros(3), {})
     data, arrays = VtkFile(tmp_path / "f.vtkhdf").step(0)
     for point in range(data.GetNumberOfPoints()):
         position = np.array(data.GetPoint(point))
@@ -117,7 +117,7 @@ def test_images_lead_paths_beyond_the_cube(comm, tmp_path):
 def test_a_single_frame_survives(comm, tmp_path):
     """The reader sees no time in such a file; it is kept as field data."""
     with product(comm, tmp_path, times=[0.4]) as file:
-        vtkhdf.write_images(tmp_path / "f.vtkhdf", FieldSeries(file, "filtered"), LENGTH, {})
+        vtkhdf.write_images(tmp_path / "f.vtkhdf", FieldSeries(file, "filtered"), LENGTH, np.zeros(3), {})
         vtkhdf.write_points(tmp_path / "p.vtkhdf", Trajectory(file, "tracers"), {})
     images, points = VtkFile(tmp_path / "f.vtkhdf"), VtkFile(tmp_path / "p.vtkhdf")
     for read in (images, points):

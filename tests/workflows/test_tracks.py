@@ -221,3 +221,55 @@ fields = ["velocity", "acceleration"]
     export.run(tmp_path / "run", tmp_path / "vtk", comm)
     with h5py.File(tmp_path / "vtk/reconstruction-fields-reconstructed.vtkhdf") as file:
         np.testing.assert_allclose(file["VTKHDF"].attrs["Spacing"], MILLIMETRES / 14)
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_volume_that_is_not_periodic(comm, twin, tmp_path, no_figures):
+    """Tracks within the inner box of 0.7 edges of the cube, with other coordinates; the field is right inside."""
+    lower, upper = 0.15 * MILLIMETRES, 0.85 * MILLIMETRES
+    if comm.rank == 0:
+        rows = np.loadtxt(twin / "tracks.csv", delimiter=",", skiprows=1)
+        rows = rows[((rows[:, 2:] > lower) & (rows[:, 2:] < upper)).all(1)]
+        rows[:, 2:] -= lower
+        np.savetxt(tmp_path / "inner.csv", rows, delimiter=",", header="track,time,x,y,z", comments="", fmt="%.15g")
+    side = upper - lower
+    scene = scene_of(comm, tmp_path, f"""[tracks]
+path = "inner.csv"
+volume = [0, {side}, 0, {side}, 0, {side}]
+time_unit = {MILLISECONDS}
+filtered = true
+filter_width = {0.2 * MILLIMETRES}
+[reconstruction]
+method = "least-squares"
+cells = 20
+fields = ["velocity", "gradient"]
+particles = true
+""")
+    run(scene, output=tmp_path / "run", comm=comm)
+    if comm.rank:
+        return
+    with h5py.File(tmp_path / "run/reconstruction.h5") as own, h5py.File(twin / "ground_truth.h5") as true:
+        about = dict(own["about"].attrs)
+        assert 2 * np.pi * about["length_unit"] > side  # with a margin
+        table = own["particles/tracks"]
+        frame = 3
+        ids, position, velocity = (table[f"{name}/value"][frame] for name in ("id", "position", "velocity"))
+        there = ids >= 0
+        assert 200 < there.sum() < 400 and (position[there] >= 0).all() and (position[there] <= side).all()
+        tracers = true["particles/tracers/velocity/value"][frame][ids[there]] * MILLIMETRES / (2 * np.pi)
+        assert relative(velocity[there], tracers) < 0.15
+        assert table["gradient/value"].shape[2:] == (9,)
+        # The plane z in the middle of the volume, away from its faces.
+        points = (np.arange(20) / 20 * 2 * np.pi * about["length_unit"] - about["corner"][0])
+        inner = np.flatnonzero((points > 0.1 * side) & (points < 0.9 * side))
+        field = own["fields/reconstructed/velocity"][frame][:, inner][:, :, inner][:, :, :, inner]
+        whole = true["fields/filtered/velocity"][frame] * MILLIMETRES / (2 * np.pi)
+    exact = at_points(whole, np.stack(np.meshgrid(*[points[inner] + lower] * 3, indexing="ij"), -1))
+    assert relative(field, exact) < 0.2
+
+
+def at_points(field, places):
+    """A field (3, z, y, x) on the cube of edge MILLIMETRES at points [z, y, x], by its Fourier series."""
+    modes, cells = np.fft.fftn(field, axes=(1, 2, 3)) / field[0].size, field.shape[1]
+    waves = np.exp(2j * np.pi / MILLIMETRES * np.multiply.outer(places[:, 0, 0, 0], np.fft.fftfreq(cells, 1 / cells)))
+    return np.einsum("czyx,iz,jy,kx->cijk", modes, waves, waves, waves).real

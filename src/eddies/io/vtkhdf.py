@@ -24,8 +24,11 @@ BLOCK_BYTES = 2**26  # of a field in memory at once
 STEP_BYTES = 2**10  # an upper limit of what a step takes beside the large datasets
 
 
-def write_images(path: Path, series: FieldSeries, length: float, provenance: Mapping[str, Any]) -> None:
+def write_images(path: Path, series: FieldSeries, length: float, corner: np.ndarray,
+                 provenance: Mapping[str, Any]) -> None:
     """Write a series of fields in a cube of edge `length` as ImageData, a step for each frame; on one rank.
+
+    `corner` (3,) is the place of the first point.
 
     The values are point data. The plane at L, equal to that at 0 by periodicity, is added along each axis, so that the
     (cells + 1)^3 points span the whole cube. ProductError if the file cannot be written.
@@ -37,7 +40,7 @@ def write_images(path: Path, series: FieldSeries, length: float, provenance: Map
         shape = (*[cells + 1] * 3, *components)
         layout[f"PointData/{variable}"] = shape if frames == 1 else (frames, *shape), sample.dtype
     with _create(path, "ImageData", frames, layout, provenance) as root:
-        write_attributes(root, {"WholeExtent": np.array([0, cells] * 3), "Origin": np.zeros(3),
+        write_attributes(root, {"WholeExtent": np.array([0, cells] * 3), "Origin": corner,
                                 "Spacing": np.full(3, length / cells), "Direction": np.eye(3).ravel()})
         _write_steps(root, series.times, {_offsets_of(name): np.arange(frames) for name in layout})
         for variable in series.variables:

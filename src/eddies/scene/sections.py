@@ -18,7 +18,7 @@ from eddies.pipeline import STAGES
 from eddies.scene.integrators import SCHEMES, Scheme
 from eddies.scene.rules import quoted
 from eddies.scene.values import (KeyProblem, SceneError, Section, boolean, choice, expanded, integer, integers, named,
-                                 number, product_file, section, sections, text, texts)
+                                 number, numbers, product_file, section, sections, text, texts)
 
 BOX_LENGTH = 2 * math.pi
 DEFAULT_WINDOW = 0.5
@@ -128,6 +128,10 @@ class Tracks(Section):
                                 "lagrangebench", "csv", default=None)
     group: str | None = text("name of the particles or of the trajectory in a file with several", default=None)
     box: float | None = number("edge of the periodic cube; absent: that of the file", default=None, above=0)
+    volume: tuple[float, ...] | None = numbers("x0, x1, y0, y1, z0, z1 of a volume that is not periodic, in place of "
+                                               "box", default=None)
+    margin: float | None = number("distance between the volume and its image in the periodic cube around it; absent: "
+                                  "four mean spacings", default=None, above=0)
     time_unit: float = number("length of the file's unit of time, in the time unit of velocities", default=1.0, above=0)
     interval: float | None = number("time between frames, for an npz file without times", default=None, above=0)
     filtered: bool = boolean("whether the particles follow a filtered velocity; false: that of the whole flow",
@@ -139,6 +143,15 @@ class Tracks(Section):
                                        default=None, above=0)
     noise: float = number("standard deviation of a measured coordinate", default=0.0, at_least=0)
     field_every: int = integer("number of frames per reconstructed field", default=5, at_least=1)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.volume is None:
+            return
+        if len(self.volume) != 6 or not all(low < high for low, high in zip(self.volume[::2], self.volume[1::2])):
+            raise self.problem("volume", "must be six numbers x0, x1, y0, y1, z0, z1, of which each second is larger")
+        if self.box is not None:
+            raise self.problem("box", "a volume is given too, which is not periodic; remove one of the two")
 
     @property
     def file(self) -> Path:
@@ -363,6 +376,7 @@ class Reconstruction(Section):
     every: int = integer("number of frames per reconstruction", default=1, at_least=1)
     fields: tuple[str, ...] = texts("quantities that are stored; gradient: du_i/dx_j, row by row; q, r: its invariants",
                                     *RECONSTRUCTED, default=("velocity", "vorticity", "pressure"))
+    particles: bool = boolean("whether the quantities are stored at the particles too", default=False)
     holdout: float = number("share of the tracks that a second reconstruction leaves out, to estimate the error; 0: "
                             "none", default=0.1, at_least=0, at_most=0.5)
     memory: float = number("time for which a wave is remembered, over 1 / (k u')", default=64.0, above=0)

@@ -101,6 +101,11 @@ def integers(about: str, default: Any = MISSING, **bounds: float) -> Any:
     return _declare(Rule(int, about, Bounds(**bounds), many=True), default)
 
 
+def numbers(about: str, default: Any = MISSING, **bounds: float) -> Any:
+    """Declare a dataclass field that holds a tuple of real numbers."""
+    return _declare(Rule(float, about, Bounds(**bounds), many=True), default)
+
+
 def boolean(about: str, default: Any = MISSING) -> Any:
     """Declare a dataclass field that holds True or False."""
     return _declare(Rule(bool, about), default)

@@ -9,6 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import ProductError, in_files, open_product
 from eddies.io.lagrangebench import shortcoming, write_dataset
@@ -73,11 +75,12 @@ def _rollout(run_directory: Path, alone: Comm) -> Iterator[tuple[Series, Provena
         yield measured.exported, measured.provenance
 
 
-def _edge_of(series: Any) -> float:
-    """Edge of the cube: of fields reconstructed from measured tracks in their unit of length."""
+def _cube_of(series: Any) -> tuple[float, np.ndarray]:
+    """Edge and first corner of the cube: of fields reconstructed from measured tracks in their unit and coordinates."""
     if isinstance(series, FieldSeries) and "about" in series.file:
-        return BOX_LENGTH * float(series.file["about"].attrs["length_unit"])
-    return BOX_LENGTH
+        about = series.file["about"].attrs
+        return BOX_LENGTH * float(about["length_unit"]), -about["corner"]
+    return BOX_LENGTH, np.zeros(3)
 
 
 def _write(output: Path, case: str, group: str, series: Any, provenance: Provenance, data_set: bool) -> bool:
@@ -95,7 +98,7 @@ def _write(output: Path, case: str, group: str, series: Any, provenance: Provena
     if data_set:
         write_dataset(path, series, case, provenance)
     elif group == "fields":
-        write_images(path, series, _edge_of(series), provenance)
+        write_images(path, series, *_cube_of(series), provenance)
     else:
         write_points(path, series, provenance)
     log.info("export: %s, %d frames", path, len(series.times))

@@ -17,8 +17,9 @@ from torch import Tensor
 
 from eddies.clock import ProgressLine
 from eddies.io.fields import FieldWriter
-from eddies.io.hdf5 import create_product, open_product, read_attributes, write_attributes, write_table
-from eddies.io.quantities import python_value
+from eddies.io.hdf5 import (File, append_frame, create_product, growing_dataset, open_product, read_attributes,
+                            write_attributes, write_table)
+from eddies.io.trajectories import write_h5md_header
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
@@ -79,6 +80,38 @@ class NeighbourMethod:
         return self._grid.to_modes(velocity.to(self._grid.dtype) - mean.to(self._grid.dtype)[:, None, None, None])
 
 
+class ParticleRows:
+    """Writes quantities at the particles of each frame to particles/tracks, in the layout of H5MD; collective.
+
+    Rows are sorted by id. Frames with fewer particles than `most` end with rows of the id -1.
+    """
+
+    def __init__(self, comm: Comm, file: File, most: int, wanted: tuple[str, ...], unit: float,
+                 corner: np.ndarray) -> None:
+        self._comm, self._most, self._unit, self._corner = comm, most, unit, corner
+        write_h5md_header(file)
+        group = file.create_group("particles/tracks")
+        write_attributes(group.create_group("box"), {"dimension": 3, "edge": BOX_LENGTH * unit})
+        self._time = growing_dataset(group, "time", (), np.float64)
+        shapes = {"id": (), "position": (3,), **{name: (RECONSTRUCTED[name],) for name in wanted}}
+        self._columns = {name: growing_dataset(group, f"{name}/value", (most, *shape), np.int64 if name == "id" else
+                                               np.float32) for name, shape in shapes.items()}
+
+    def append(self, time: float, particles: ParticleSet, values: Mapping[str, np.ndarray]) -> None:
+        """Add a frame: the particles of this rank and the values at them."""
+        columns = {"id": as_numpy(particles.id), "position": as_numpy(particles.position) * self._unit - self._corner,
+                   **values}
+        append_frame(self._time, np.array(time), ())
+        for name, dataset in self._columns.items():
+            parts, ids = self._comm.gather(columns[name]), self._comm.gather(columns["id"])
+            block = np.zeros((0, *dataset.shape[2:]))
+            if parts is not None:
+                block = np.full((self._most, *dataset.shape[2:]), -1 if name == "id" else 0.0)
+                order = np.argsort(np.concatenate(ids))
+                block[:len(order)] = np.concatenate(parts)[order]
+            append_frame(dataset, block, (0,) * (dataset.ndim - 1))
+
+
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Write reconstruction.h5: the quantities of [reconstruction] fields on a grid, and errors over time.
 
@@ -90,12 +123,12 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     settings, tracers, directory = scene.reconstruction, scene.tracers, Path(directory)
     with ExitStack() as files:
         truth_file = files.enter_context(open_product(comm, directory / STAGES["dns"].file, "ground_truth"))
-        reference, unit = read_attributes(truth_file, "reference"), 1.0
+        reference, unit, corner = read_attributes(truth_file, "reference"), 1.0, np.zeros(3)
         truth, source = None, None
         if scene.tracks is not None:
             source = TrackFrames(comm, scene.tracks)
-            times, count = source.times, source.mean_count
-            unit = float(python_value(source.about["length_unit"]))
+            times, count = source.times, (BOX_LENGTH / source.spacing) ** 3
+            unit, corner = source.about["length_unit"], source.about["corner"]
         slab = SlabDecomposition(comm, BOX_LENGTH, tracers.planes)
         if source is None:
             truth = GroundTruth(truth_file, slab)
@@ -125,6 +158,10 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         with create_product(comm, directory / STAGES["reconstruct"].file, "reconstruction",
                             stage_provenance(scene, "reconstruct")) as file:
             writer = FieldWriter(file, "reconstructed", cells, {name: RECONSTRUCTED[name] for name in settings.fields})
+            rows_of_particles = None
+            if settings.particles:
+                most = truth.total if truth is not None else source.most
+                rows_of_particles = ParticleRows(comm, file, most, settings.fields, unit, corner)
             for number, frame in enumerate(frames):
                 if stop is not None:
                     stop.check()
@@ -132,8 +169,10 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 modes = methods[0].of(now, float(times[frame]))
                 row = {"time": float(times[frame]), "seconds": time.perf_counter() - began}
                 mean = as_numpy(mean_over_ranks(comm, now.velocity))
-                writer.append(times[frame], target.decomposition.start, quantities(
-                    modes, mean, transfer, reference["viscosity"], grid, target, settings.fields, unit))
+                made = Quantities(modes, mean, transfer, reference["viscosity"], grid, settings.fields, unit)
+                writer.append(times[frame], target.decomposition.start, made.on(target))
+                if rows_of_particles is not None:
+                    rows_of_particles.append(float(times[frame]), now, made.at(now))
                 if settings.holdout > 0:
                     known, apart = split(now, settings.holdout)
                     row["validation_error"] = validation_error(solver, methods[1].of(known, float(times[frame])), known,
@@ -148,7 +187,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                     write_table(file, name, {key: np.array([row[key] for row in table]) for key in table[0]})
             write_attributes(file.create_group("about"), {
                 "method": settings.method, "particles": float(count), "weight": weight, "length_unit": unit,
-                "holdout": settings.holdout, "highest_wavenumber": grid.resolved})
+                "corner": corner, "holdout": settings.holdout, "highest_wavenumber": grid.resolved})
     log.info("reconstruct: %s; means over time: %s", settings.method, ", ".join(
         f"{key.replace('_', ' ')} {np.mean([row[key] for row in table]):.3g}"
         for table in (rows, compared) if table for key in table[0] if key != "time"))
@@ -171,33 +210,56 @@ def _maker(scene: Scene, comm: Comm, directory: Path, solver: ResolvedVelocity, 
     return lambda: NeighbourMethod(form, solver.grid)
 
 
-@torch.no_grad()
-def quantities(modes: Tensor, mean: np.ndarray, transfer: Tensor, viscosity: float, grid: FourierGrid,
-               target: SpectralGrid, wanted: tuple[str, ...], unit: float) -> dict[str, np.ndarray]:
-    """Planes (components, z_local, y, x) of the wanted quantities on a grid, in units of length `unit`.
+class Quantities:
+    """The quantities of one frame, made from the modes of the velocity relative to its mean.
 
-    modes : of the velocity, relative to its mean (3,). transfer : G of the filter that it has passed.
+    Parameters
+    ----------
+    modes : (3, kz, ky, kx) on `grid`. mean : of the velocity, (3,). transfer : G of the filter that it has passed.
+    viscosity : nu. wanted : names of RECONSTRUCTED. unit : of length.
     """
-    def planes(of: Tensor) -> np.ndarray:
-        return target.backward(regrid(grid.spectral, target, as_numpy(of.resolve_conj())))
 
-    found: dict[str, np.ndarray] = {}
-    if "velocity" in wanted:
-        found["velocity"] = unit * (planes(modes) + mean[:, None, None, None])
-    if {"gradient", "vorticity", "q", "r"} & {*wanted}:
-        slopes = planes(torch.cat([grid.gradient(component) for component in modes]))
-        a = slopes.reshape(3, 3, *slopes.shape[1:])
-        square = np.einsum("ijzyx,jkzyx->ikzyx", a, a)
-        found |= {"gradient": slopes, "vorticity": np.stack([a[2, 1] - a[1, 2], a[0, 2] - a[2, 0], a[1, 0] - a[0, 1]]),
-                  "q": -np.einsum("iizyx->zyx", square)[None] / 2,
-                  "r": -np.einsum("ijzyx,jizyx->zyx", square, a)[None] / 3}
-    if {"pressure", "acceleration"} & {*wanted}:
-        whole = grid.squares(modes / transfer)
-        found["pressure"] = unit**2 * planes((transfer * grid.pressure_of(whole))[None])
-        change = -transfer * grid.solenoidal(grid.stress_divergence(whole)) - viscosity * (
-            grid.wavenumber_squared * modes)
-        found["acceleration"] = unit * planes(change + grid.stress_divergence(grid.squares(modes)))
-    return {name: found[name] for name in wanted}
+    @torch.no_grad()
+    def __init__(self, modes: Tensor, mean: np.ndarray, transfer: Tensor, viscosity: float, grid: FourierGrid,
+                 wanted: tuple[str, ...], unit: float) -> None:
+        self.grid, self.wanted, self.unit, self.mean = grid, wanted, unit, mean
+        self._modes = {"velocity": modes}
+        if {"gradient", "vorticity", "q", "r"} & {*wanted}:
+            self._modes["gradient"] = torch.cat([grid.gradient(component) for component in modes])
+        if {"pressure", "acceleration"} & {*wanted}:
+            whole = grid.squares(modes / transfer)
+            self._modes["pressure"] = (transfer * grid.pressure_of(whole))[None]
+            self._modes["acceleration"] = (
+                grid.stress_divergence(grid.squares(modes)) - transfer * grid.solenoidal(grid.stress_divergence(whole))
+                - viscosity * grid.wavenumber_squared * modes)
+
+    def on(self, target: SpectralGrid) -> dict[str, np.ndarray]:
+        """Planes (components, z_local, y, x) on another grid; collective."""
+        return self._of(lambda modes: target.backward(regrid(self.grid.spectral, target, as_numpy(
+            modes.resolve_conj()))))
+
+    @torch.no_grad()
+    def at(self, particles: ParticleSet) -> dict[str, np.ndarray]:
+        """Values (n, components) at the particles of this rank; collective."""
+        points = self.grid.points(particles.position)
+        found = self._of(lambda modes: as_numpy(self.grid.at(modes, points)).T)
+        return {name: values.T for name, values in found.items()}
+
+    def _of(self, values: Callable[[Tensor], np.ndarray]) -> dict[str, np.ndarray]:
+        """The quantities from the values (components, ...) of modes."""
+        given = {name: values(modes) for name, modes in self._modes.items()}
+        velocity = given["velocity"]
+        found = {"velocity": self.unit * (velocity + self.mean.reshape(3, *[1] * (velocity.ndim - 1)))}
+        if "gradient" in given:
+            a = given["gradient"].reshape(3, 3, *velocity.shape[1:])
+            square = np.einsum("ij...,jk...->ik...", a, a)
+            found |= {"gradient": given["gradient"],
+                      "vorticity": np.stack([a[2, 1] - a[1, 2], a[0, 2] - a[2, 0], a[1, 0] - a[0, 1]]),
+                      "q": -np.einsum("ii...->...", square)[None] / 2,
+                      "r": -np.einsum("ij...,ji...->...", square, a)[None] / 3}
+        if "pressure" in given:
+            found |= {"pressure": self.unit**2 * given["pressure"], "acceleration": self.unit * given["acceleration"]}
+        return {name: found[name] for name in self.wanted}
 
 
 def errors_of(modes: Tensor, mean: np.ndarray, filtered: bool, filter_width: float, grid: FourierGrid,

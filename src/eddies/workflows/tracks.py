@@ -19,6 +19,7 @@ from eddies.io.hdf5 import create_product, in_files, write_attributes, write_tab
 from eddies.io.trajectories import TrajectoryWriter
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import id_block
+from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.flow_units import measured_scales
@@ -69,6 +70,9 @@ def _unfit(scene: Scene) -> Iterator[str]:
     if learned and not settings.filtered:
         yield (f"[tracks] filtered = false: models are those of a filtered velocity; remove {', '.join(learned)}, or "
                "set filtered = true if the tracks follow one")
+    if learned and settings.volume is not None:
+        yield (f"[tracks] volume: models need particles in the whole periodic cube; remove {', '.join(learned)}, or "
+               "give box if the flow is periodic")
     viscous = [name for name, term in model.settings.items() if term.viscous] if model else []
     if settings.viscosity is None and viscous:
         yield (f'[tracks] viscosity: this key is missing, and the term "{viscous[0]}" needs it; give it, or choose '
@@ -87,7 +91,7 @@ def _sections_of(settings: Tracks, learned: bool) -> dict[str, Flow | Tracers]:
         raise SceneError(f"{settings.file}: {tracks.complete} of {tracks.about['in_file']} tracks are there in all "
                          f"{len(tracks.times)} frames, and a model needs {LEAST_TRACKS}; give a part of the file with "
                          "fewer frames")
-    count = tracks.complete if learned else max(round(tracks.mean_count), LEAST_TRACKS)
+    count = tracks.complete if learned else max(round((BOX_LENGTH / tracks.spacing) ** 3), LEAST_TRACKS)
     speed = float(np.sqrt(np.mean(tracks.columns["velocity"]**2)))
     turnover = INTEGRAL_SCALE * BOX_LENGTH / speed if speed > 0 else math.inf
     width = None if settings.filter_width is None else settings.filter_width / tracks.unit
@@ -109,9 +113,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     """
     tracers, tracks = scene.tracers, TrackFrames(comm, scene.tracks)
     complete, times = tracks.complete, tracks.times
-    spacing = BOX_LENGTH / tracks.mean_count ** (1 / 3)
-    slab = SlabDecomposition(comm, BOX_LENGTH, tracers.with_count(round(tracks.mean_count)).planes)
-    first, second = (tracks.frame(frame, complete >= LEAST_TRACKS) for frame in (0, 1))
+    spacing = tracks.spacing
+    slab = SlabDecomposition(comm, BOX_LENGTH, tracers.with_count(round((BOX_LENGTH / spacing) ** 3)).planes)
+    first, second = tracks.shared(0, 1), tracks.shared(1, 0)
     reference = {"filter_width": tracers.filter_width, "spacing": tracers.spacing, "density_mean": 1.0,
                  "viscosity": scene.flow.viscosity, **measured_scales(comm, first, second, tracks.times[1])}
     width = tracers.filter_width if tracers.filtered else NO_FILTER * spacing
@@ -170,6 +174,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
 class FrameFlow:
     """The velocity field of one frame.
 
+    Energies are those where the particles are, so that a margin without particles has no effect.
+
     Parameters
     ----------
     resolved : the result of least squares. columns : this rank's rows of the frame.
@@ -183,7 +189,10 @@ class FrameFlow:
         whole = resolved.unfiltered if tracers.filtered else resolved.velocity
         self.filtered = as_numpy(resolved.velocity if tracers.filtered else
                                  whole * resolved.grid.filter_transfer(tracers.filter_width))
-        self.energy, self.filtered_energy = (energy_spectrum(self.grid, modes)[1]
+        square, count = global_sum(comm, np.array([
+            float(resolved.at_particles(resolved.velocity).square().sum()), len(velocity)]))
+        among = square / count / (2 * energy_spectrum(self.grid, as_numpy(resolved.velocity))[1].sum())
+        self.energy, self.filtered_energy = (among * energy_spectrum(self.grid, modes)[1]
                                              for modes in (as_numpy(whole), self.filtered))
 
     def scales(self, viscosity: float) -> dict[str, float]:

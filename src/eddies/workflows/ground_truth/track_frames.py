@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
 from eddies.analysis.track_splines import smooth
 from eddies.io.hdf5 import in_files
-from eddies.io.track_files import check_box, read_tracks
+from eddies.io.track_files import Tracks, check_box, read_tracks
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import block_starts
 from eddies.scene.scene import BOX_LENGTH, SceneError
-from eddies.scene.sections import Tracks
+from eddies.scene.sections import Tracks as Settings
 
 UNEQUAL = 1e-3    # largest relative difference of two intervals between frames
 LEAST_FRAMES = 3
+MARGIN = 4.0      # spacings between a volume and its periodic image
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,8 @@ class MeasuredTracks:
     times : from 0 on, (frames,). starts : first row of each frame, and the number of rows, (frames + 1,).
     columns : id (rows,), position and velocity (rows, 3), and density (rows,) over its mean, if it was asked for.
     throughout : whether the track of a row is there in all frames, (rows,).
-    unit : of length, in that of the file.
+    spacing : mean distance of the particles of a frame, in the volume in which they are.
+    unit : of length, in that of the file. corner : place of the file's origin.
     about : words and numbers on the file and on what was left out.
     """
 
@@ -37,8 +40,10 @@ class MeasuredTracks:
     starts: np.ndarray
     columns: Mapping[str, np.ndarray]
     throughout: np.ndarray
+    spacing: float
     unit: float
-    about: Mapping[str, str | float]
+    corner: np.ndarray
+    about: Mapping[str, Any]
 
     @property
     def interval(self) -> float:
@@ -55,35 +60,49 @@ class MeasuredTracks:
         return int(self.throughout[:self.starts[1]].sum())
 
     def frame(self, number: int, complete: bool = False) -> dict[str, np.ndarray]:
-        """The rows of a frame; `complete`: only those of tracks that are there in all frames, with ids 0, 1, ..."""
+        """The rows of a frame; `complete`: those of tracks that are there in all frames, with ids 0, 1, ..."""
         rows = np.arange(*self.starts[number:number + 2])
         if not complete:
             return {name: values[rows] for name, values in self.columns.items()}
         rows = rows[self.throughout[rows]]
         return {name: values[rows] for name, values in self.columns.items()} | {"id": np.arange(len(rows))}
 
+    def shared(self, number: int, other: int) -> dict[str, np.ndarray]:
+        """The rows of a frame whose tracks are in another frame too."""
+        rows, others = (np.arange(*self.starts[frame:frame + 2]) for frame in (number, other))
+        rows = rows[np.isin(self.columns["id"][rows], self.columns["id"][others])]
+        return {name: values[rows] for name, values in self.columns.items()}
+
 
 class TrackFrames:
     """The frames of a file with tracks, which rank 0 holds; all ranks make one, and call its methods together."""
 
-    def __init__(self, comm: Comm, settings: Tracks) -> None:
+    def __init__(self, comm: Comm, settings: Settings) -> None:
         self.comm = comm
-        self.times, self.about, self.mean_count, self.complete = in_files(comm, settings.file, lambda: (
-            (found := measured(settings)).times, found.about, found.mean_count, found.complete))
+        self.times, self.about, self.mean_count, self.complete, self.spacing, self.most = in_files(
+            comm, settings.file, lambda: ((found := measured(settings)).times, found.about, found.mean_count,
+                                          found.complete, found.spacing, int(np.diff(found.starts).max())))
         self._tracks = measured(settings) if comm.rank == 0 else None
 
     def frame(self, number: int, complete: bool = False) -> dict[str, np.ndarray]:
         """This rank's block of the rows of a frame (`MeasuredTracks.frame`)."""
+        return self._block(lambda tracks: tracks.frame(number, complete))
+
+    def shared(self, number: int, other: int) -> dict[str, np.ndarray]:
+        """This rank's block of the rows of a frame that another frame has too (`MeasuredTracks.shared`)."""
+        return self._block(lambda tracks: tracks.shared(number, other))
+
+    def _block(self, rows: Callable[[MeasuredTracks], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
         blocks = None
         if self._tracks is not None:
-            columns, size = self._tracks.frame(number, complete), self.comm.size
+            columns, size = rows(self._tracks), self.comm.size
             starts = block_starts(len(columns["id"]), size)
             blocks = [{name: values[start:stop] for name, values in columns.items()}
                       for start, stop in zip(starts, starts[1:])]
         return dict(self.comm.scatter(blocks))
 
 
-def measured(settings: Tracks) -> MeasuredTracks:
+def measured(settings: Settings) -> MeasuredTracks:
     """The tracks of a file; one rank calls it. Tracks with fewer than three rows that need a spline are left out.
 
     Raises ProductError if the file is unfit, SceneError if it has too few frames.
@@ -93,24 +112,22 @@ def measured(settings: Tracks) -> MeasuredTracks:
 
 
 @lru_cache(maxsize=1)  # a run asks twice
-def _measured(settings: Tracks, state: tuple[int, int] | None) -> MeasuredTracks:
+def _measured(settings: Settings, state: tuple[int, int] | None) -> MeasuredTracks:
     found = read_tracks(settings.file, settings.format, settings.group, settings.interval)
-    edge = settings.box if settings.box is not None else found.edge
-    if edge is None:
-        raise SceneError("[tracks] box: this key is missing, and the file has no cubic box; give the edge of the "
-                         "periodic cube")
+    found, edge, volume, corner = _placed(found, settings)
     if settings.sound_speed is not None and found.density is None:
         raise SceneError(f"[tracks] sound_speed = {settings.sound_speed:g}: {settings.file} has no densities; remove "
                          "the key")
     found = replace(found, time=found.time * settings.time_unit)
-    check_box(found, edge, settings.file)
+    if settings.volume is None:
+        check_box(found, edge, settings.file)
     times, intervals = found.times, np.diff(found.times)
     if len(times) < LEAST_FRAMES:
         raise SceneError(f"{settings.file}: has {len(times)} frames; at least {LEAST_FRAMES} are needed")
     if np.ptp(intervals) > UNEQUAL * intervals.mean():
         raise SceneError(f"{settings.file}: frames follow each other at intervals of {intervals.min():g} to "
                          f"{intervals.max():g}; equal ones are needed")
-    about: dict[str, str | float] = {"file": settings.path, "in_file": len(np.unique(found.track))}
+    about: dict[str, Any] = {"file": settings.path, "in_file": len(np.unique(found.track))}
     position, velocity = found.position, found.velocity
     if velocity is None or settings.noise > 0:
         splines = smooth(found.time, found.track, position, edge, settings.noise)
@@ -121,10 +138,35 @@ def _measured(settings: Tracks, state: tuple[int, int] | None) -> MeasuredTracks
         if len(found.times) < len(times):
             raise SceneError(f"{settings.file}: {len(times) - len(found.times)} of {len(times)} frames have no track "
                              "with three rows or more, which a velocity needs; give the velocities, or longer tracks")
-    names, place, counts = np.unique(found.track, return_inverse=True, return_counts=True)
+    _, place, counts = np.unique(found.track, return_inverse=True, return_counts=True)
     unit = edge / BOX_LENGTH
-    columns = {"id": place, "position": position / unit % BOX_LENGTH, "velocity": velocity / unit}
+    columns = {"id": found.track, "position": position / unit % BOX_LENGTH, "velocity": velocity / unit}
     if settings.sound_speed is not None:
         columns["density"] = found.density / found.density.mean()
-    return MeasuredTracks(times - times[0], found.starts, columns, (counts == len(times))[place], unit,
-                          about | {"length_unit": unit})
+    spacing = (volume / (len(found.time) / len(times))) ** (1 / 3) / unit
+    return MeasuredTracks(times - times[0], found.starts, columns, (counts == len(times))[place], spacing, unit, corner,
+                          about | {"length_unit": unit, "corner": corner})
+
+
+def _placed(found: Tracks, settings: Settings) -> tuple[Tracks, float, float, np.ndarray]:
+    """Rows in a periodic cube, its edge, the volume with particles, and the place of the file's origin in the cube.
+
+    A volume that is not periodic lies in the middle of a larger cube, `margin` away from its images.
+    """
+    if settings.volume is None:
+        edge = settings.box if settings.box is not None else found.edge
+        if edge is None:
+            raise SceneError("[tracks] box: this key is missing, and the file has no cubic box; give the edge of the "
+                             "periodic cube, or the volume of the measurement")
+        return found, edge, edge**3, np.zeros(3)
+    lower, upper = np.reshape(settings.volume, (3, 2)).T
+    outside = ((found.position < lower) | (found.position > upper)).any(1)
+    if outside.any():
+        row = int(np.argmax(outside))
+        raise SceneError(f"[tracks] volume: track {found.track[row]} of {settings.file} is outside at time "
+                         f"{found.time[row]:g} ({outside.sum()} such rows); correct the volume or the unit of length")
+    whole = float(np.prod(upper - lower))
+    spacing = (whole / (len(found.time) / len(found.times))) ** (1 / 3)
+    edge = float((upper - lower).max()) + (MARGIN * spacing if settings.margin is None else settings.margin)
+    corner = (edge - (upper - lower)) / 2 - lower
+    return replace(found, position=found.position + corner), edge, whole, corner
