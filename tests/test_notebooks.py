@@ -130,3 +130,12 @@ def test_error_against_run_time(execute, folder):
     assert front == [[*rows][number] for number in pareto_front(cost, error)]
     errors = [rows[name]["velocity_error_end"] for name in ("grid-24", "grid-16", "grid-8")]
     assert errors == sorted(errors) and rows["learned"]["velocity_error_end"] < rows["no-force"]["velocity_error_end"]
+
+
+def test_measured_tracks(execute, folder):
+    cells, (error, estimate, misses, without) = execute(
+        "measured-tracks", "[error, estimate, misses.values.tolist(), without.values.tolist()]",
+        changes=[change for change in SMALLER if not change.startswith("kernel")])
+    assert set(figures(cells)) == {"fields", "forecast"} and min(map(len, figures(cells).values())) > 9000
+    assert 0 < error < 0.1 and 0.3 < estimate / error < 3
+    assert len(misses) > 1 and np.all(np.less(misses[1:], without[1:]))
