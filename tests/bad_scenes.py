@@ -31,6 +31,12 @@ BAD_TEXTS = [
     (FLOW + TIME + "[simulation]\nturnovers = 1\nframe_interval = 1\n", "[simulation]: needs a section [model]"),
     (FLOW + LEARNING + "[model]\n", "[model]: needs a section [training]"),
     (FLOW + TRACERS.replace("8", "12"), "[tracers] field_cells: is 18 (from particles_per_side) and must be at most"),
+    (FLOW + "[tracers]\nturnovers = 1\nframe_interval = 1\n", "[tracers] particles_per_side: this key is missing"),
+    (FLOW + TRACERS + "count = 100\n", "[tracers] particles_per_side = 8: count is given too"),
+    ("[tracks]\nbox = 1\n", "[tracks] path: this key is missing (file with the tracks)"),
+    ('[tracks]\npath = "a.csv"\nvolume = [0, 1]\n', "[tracks] volume = [0.0, 1.0]: must be six numbers"),
+    ('[tracks]\npath = "a.csv"\nbox = 1\nvolume = [0, 1, 0, 1, 0, 1]\n', "[tracks] box = 1.0: a volume is given too"),
+    ('[tracks]\npath = "a.csv"\nformat = "cvs"\n', '[tracks] format = "cvs": must be one of "h5md"'),
     (FLOW + TIME + "realisations = [3]\n", "[time] realisations: no such key"),
     ("realisations = [3]\n" + FLOW + TIME, "realisations = [3]: the scene has no [simulation]"),
 ]

@@ -1,0 +1,153 @@
+"""Fields from tracks of a simulated flow beside the true fields: methods, noise, lost tracks, a volume. A script.
+
+    mpirun -n 2 .venv/bin/eddies dns tests/validation/tracks.toml [--set seed=2 --output runs/tracks-2]
+    mpirun -n 2 .venv/bin/python tests/validation/twin_tracks.py runs/tracks [runs/tracks-2 ...]
+
+Writes the tracks of each case as a user would have them, reconstructs them, and compares the fields, after the filter
+of the stored ones, with these. Prints means and standard deviations over the runs, at all times after the first t_eta,
+and writes docs/results/tracks.json.
+"""
+
+import json
+import sys
+import tempfile
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from mpi4py import MPI
+
+import eddies
+
+HERE = Path(__file__).parents[2] / "docs/results/tracks.json"
+BOX = 2 * np.pi
+TURNOVER_LOSS = 0.2  # share of the tracks that is lost at random in a turnover
+
+
+@dataclass(frozen=True)
+class Case:
+    """A reconstruction: set of tracers, method, and what is done to the tracks.
+
+    noise : standard deviation of a coordinate, over the mean spacing; velocities are then found by splines, as with
+    `splines`. lost : whether tracks are lost. inner : side of a volume that is not periodic, over the edge of the cube.
+    """
+
+    tracks: str
+    method: str = "least-squares"
+    noise: float = 0.0
+    splines: bool = False
+    lost: bool = False
+    inner: float = 1.0
+
+
+CASES = [
+    *(Case(name, method) for name in ("whole-8", "whole-16", "whole-32", "filtered-16", "filtered-32")
+      for method in ("least-squares", "memory")),
+    *(Case(name, method) for name in ("whole-16", "filtered-32") for method in ("kriging", "quadratic", "average")),
+    *(Case("whole-16", method, splines=True) for method in ("least-squares", "memory")),
+    *(Case("whole-16", method, noise) for noise in (0.1, 0.3) for method in ("least-squares", "memory")),
+    *(Case("whole-16", method, lost=True) for method in ("least-squares", "memory")),
+    *(Case("whole-32", method, inner=0.5) for method in ("least-squares", "memory"))]
+
+
+def write(case: Case, truth: h5py.File, path: Path, seed: int) -> str:
+    """Write the tracks of a case; returns the lines of [tracks]."""
+    holder, reference = truth["particles/tracers"], truth["reference"].attrs
+    times, position = (holder[f"position/{name}"][()] for name in ("time", "value"))
+    velocity, draw = holder["velocity/value"][()], np.random.default_rng(seed)
+    frame, track = (part.ravel() for part in np.indices(position.shape[:2]))
+    kept = np.ones(frame.size, bool)
+    if case.lost:
+        rate = -np.log(1 - TURNOVER_LOSS) / reference["eddy_turnover_time"]
+        kept &= times[frame] < draw.exponential(1 / rate, position.shape[1])[track]
+    spacing, half = float(reference["spacing"]), case.inner * BOX / 2
+    position = position[frame, track] + case.noise * spacing * draw.standard_normal((frame.size, 3))
+    lines = [f'path = "{path.name}"', f"filter_width = {float(reference['filter_width'])}",
+             f"viscosity = {float(reference['viscosity'])}", f"filtered = {str(case.tracks[0] == 'f').lower()}"]
+    if case.inner < 1:
+        kept &= (np.abs(position - np.pi) < half).all(1)
+        lines.append(f"volume = {[float(np.pi - half), float(np.pi + half)] * 3}")
+    else:
+        position, lines = position % BOX, [*lines, f"box = {BOX}"]
+    splines = case.noise > 0 or case.splines
+    if case.noise:
+        lines.append(f"noise = {case.noise * spacing}")
+    eddies.write_tracks(path, times[frame[kept]], track[kept], position[kept],
+                        None if splines else velocity[frame, track][kept])
+    return "\n".join(lines)
+
+
+def errors_of(case: Case, directory: Path, truth: h5py.File) -> dict[str, np.ndarray]:
+    """Errors of filtered velocity and gradient over the frames whose fields are stored, and the estimate."""
+    reference = truth["reference"].attrs
+    found: dict[str, list[float]] = defaultdict(list)
+    with h5py.File(directory / "reconstruction.h5") as file:
+        edge = BOX * float(file["about"].attrs["length_unit"])
+        corner, fields = file["about"].attrs["corner"], file["fields/reconstructed"]
+        times, cells = fields["time"][()], fields.attrs["cells"]
+        width = 0.0 if case.tracks[0] == "f" else float(reference["filter_width"])
+        for time, exact in zip(truth["fields/filtered/time"][()], truth["fields/filtered/velocity"]):
+            frame = int(np.argmin(np.abs(times - time)))
+            if abs(times[frame] - time) > 1e-6 or time < float(reference["kolmogorov_time"]):
+                continue
+            axis = np.arange(cells) / cells * BOX
+            inside = np.flatnonzero(np.abs(axis - np.pi) <= case.inner * BOX / 2 * (1 if case.inner == 1 else 0.9))
+            own = at_points(fields["velocity"][frame], edge, axis[inside] + corner[0], width)
+            true = at_points(exact, BOX, axis[inside], 0.0)
+            for name, pair in zip(("velocity", "gradient"), zip(own, true)):
+                found[f"{name}_error"].append(np.linalg.norm(pair[0] - pair[1]) / np.linalg.norm(pair[1]))
+        table = file["errors_over_time"]
+        late = table["time"][()] > float(reference["kolmogorov_time"])
+        found["validation_error"] = list(table["validation_error"][late])
+        found["seconds"] = list(table["seconds"][late])
+    return {name: np.array(values) for name, values in found.items()}
+
+
+def at_points(field: np.ndarray, edge: float, places: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """A field (3, z, y, x) on a periodic cube and its gradient at the points of a grid, after a Gaussian filter."""
+    cells = field.shape[1]
+    number = np.fft.fftfreq(cells, 1 / cells) * (np.abs(np.fft.fftfreq(cells, 1 / cells)) < cells / 2)
+    k = 2 * np.pi / edge * number
+    squared = k[:, None, None]**2 + k[:, None]**2 + k**2
+    modes = np.fft.fftn(field, axes=(1, 2, 3)) / cells**3 * np.exp(-squared * width**2 / 24)
+    waves = np.exp(1j * np.multiply.outer(places, k))
+
+    def values(of: np.ndarray) -> np.ndarray:
+        return np.einsum("...zyx,iz,jy,kx->...ijk", of, waves, waves, waves, optimize=True).real
+
+    return values(modes), np.stack([values(modes * 1j * along) for along in (k, k[:, None], k[:, None, None])], 1)
+
+
+def main(runs: list[Path]) -> None:
+    """Run all cases on all flows."""
+    comm, rows = MPI.COMM_WORLD, []
+    for case in CASES:
+        found = defaultdict(list)
+        for seed, run in enumerate(runs):
+            path = Path(comm.bcast(tempfile.mkdtemp() if comm.rank == 0 else None))
+            with h5py.File(run / case.tracks / "ground_truth.h5") as truth:
+                if comm.rank == 0:
+                    lines = write(case, truth, path / "tracks.h5", seed)
+                    cells = truth["fields/filtered"].attrs["cells"]
+                    (path / "scene.toml").write_text(
+                        f'[tracks]\n{lines}\n[reconstruction]\nmethod = "{case.method}"\ncells = {2 * cells}\n'
+                        'fields = ["velocity"]\n')
+                comm.Barrier()
+                eddies.run(path / "scene.toml", stages=["dns", "reconstruct"], output=path / "run", comm=comm)
+                if comm.rank == 0:
+                    for name, values in errors_of(case, path / "run", truth).items():
+                        found[name].append(values.mean())
+        if comm.rank == 0:
+            row = {**case.__dict__, **{name: (np.mean(values), np.std(values, ddof=min(1, len(values) - 1)))
+                                       for name, values in found.items()}}
+            rows.append(row)
+            print(case, {name: f"{mean:.4f} ± {spread:.4f}" for name, (mean, spread) in
+                         ((name, row[name]) for name in found)}, flush=True)
+    if comm.rank == 0:
+        HERE.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main([Path(path) for path in sys.argv[1:]])
