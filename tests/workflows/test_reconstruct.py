@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from eddies.parallel.slab import SlabDecomposition
+from eddies.parallel.stop import Stopped
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.particle_set import ParticleSet
 from eddies.scene.scene import Reconstruction
@@ -15,6 +16,7 @@ from eddies.scene.sections import RECONSTRUCTED
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows import reconstruct
 from tests.workflows.small_rollout import prepared
+from tests.workflows.stopping import StopAtStep
 
 # The largest error of each; the flow has most of its energy near the filter.
 METHODS = {"least-squares": 0.1, "memory": 0.1, "kriging": 0.1, "quadratic": 0.15, "linear": 0.35, "average": 0.35}
@@ -107,3 +109,28 @@ def test_fields_do_not_depend_on_the_number_of_ranks(comm, flow, tmp_path, linke
         np.testing.assert_allclose(first, second, atol=1e-4)
     comm.Barrier()
     assert errors["velocity_error"] < 0.1
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("method", ["least-squares", "memory"])
+def test_a_stopped_reconstruction_is_the_one_never_stopped(comm, flow, tmp_path, linked, method):
+    scene, folder = flow
+    scene = replace(scene, reconstruction=Reconstruction(method=method, fields=("velocity", "r"), particles=True))
+    found = []
+    for steps in (10**9, 3):
+        directory = tmp_path / str(steps)
+        if comm.rank == 0:
+            directory.mkdir()
+            (directory / "ground_truth.h5").symlink_to(folder / "ground_truth.h5")
+        comm.Barrier()
+        if steps == 3:
+            with pytest.raises(Stopped, match="from step 3 of the reconstruction"):
+                reconstruct.run(scene, comm, directory, StopAtStep(comm, steps))
+        reconstruct.run(scene, comm, directory)
+        assert not (directory / "checkpoints-reconstruct").exists()
+        with h5py.File(directory / "reconstruction.h5") as file:
+            found.append({name: file[name][()] for name in (
+                "fields/reconstructed/velocity", "fields/reconstructed/r", "particles/tracks/track/value",
+                "particles/tracks/velocity/value", "errors_over_time/validation_error", "errors_of_fields/time")})
+    for name, values in found[0].items():
+        np.testing.assert_array_equal(values, found[1][name], err_msg=name)

@@ -253,8 +253,8 @@ particles = true
         assert 2 * np.pi * about["length_unit"] > side  # with a margin
         table = own["particles/tracks"]
         frame = 3
-        ids, position, velocity = (table[f"{name}/value"][frame] for name in ("id", "position", "velocity"))
-        there = ids >= 0
+        ids, position, velocity = (table[f"{name}/value"][frame] for name in ("track", "coordinates", "velocity"))
+        there, ids = ids >= 0, ids.astype(int)
         assert 200 < there.sum() < 400 and (position[there] >= 0).all() and (position[there] <= side).all()
         tracers = true["particles/tracers/velocity/value"][frame][ids[there]] * MILLIMETRES / (2 * np.pi)
         assert relative(velocity[there], tracers) < 0.15

@@ -41,9 +41,8 @@ PARTICLES, FIELD, ROW = "time particle", "time component z y x", "row"
 POINTS = "at the points i edge / cells of the periodic cube, i = 0, 1, ..."
 # Quantities by path in the file; the first match counts.
 QUANTITIES = {
-    "particles/tracks/time": Quantity("T", "time", "of the tracks"),
-    "particles/tracks/id/value": Quantity("1", PARTICLES, "of the track; -1: a row without a particle"),
-    "particles/tracks/position/value": Quantity("L", f"{PARTICLES} xyz", "in the coordinates of the file"),
+    "particles/tracks/track/value": Quantity("1", PARTICLES, "number of the track of a row; -1: a row without one"),
+    "particles/tracks/coordinates/value": Quantity("L", f"{PARTICLES} xyz", "in the file of the tracks"),
     "particles/tracks/*/value": Quantity("", PARTICLES, "as of the fields of this name, at the particles"),
     "particles/*/id": Quantity("1", "particle", "of the particle in each row of every frame"),
     "particles/*/step": Quantity("1", "time", "number of the time step"),

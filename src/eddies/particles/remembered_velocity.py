@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -73,6 +75,19 @@ class RememberedVelocity:
             modes = prior + change.modes
         self._latest, self._count = (time, modes, as_numpy(mean)), count
         return modes
+
+    def state_dict(self) -> dict[str, Any]:
+        """What the next moment needs of the last: modes and penalty as tensors, and plain values."""
+        if self._latest is None:
+            return {}
+        time, modes, drift = self._latest
+        return {"modes": modes, "penalty": self._penalty, "time": time, "drift": drift.tolist(), "count": self._count}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore that."""
+        if state:
+            self._latest = state["time"], state["modes"], np.array(state["drift"])
+            self._penalty, self._count = state["penalty"], state["count"]
 
     def forecast(self, modes: Tensor, step: float) -> Tensor:
         """The modes after a time, by Runge-Kutta steps of fourth order."""

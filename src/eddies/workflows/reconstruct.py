@@ -4,22 +4,20 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from time import perf_counter
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from eddies.clock import ProgressLine
-from eddies.io.fields import FieldWriter
-from eddies.io.hdf5 import (File, append_frame, create_product, growing_dataset, open_product, read_attributes,
-                            write_attributes, write_table)
-from eddies.io.trajectories import write_h5md_header
+from eddies.io.checkpoint import Checkpoint, Guard
+from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments, TrajectoryLayout
+from eddies.io.hdf5 import File, create_product, open_product, read_attributes, write_attributes, write_table
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
@@ -34,14 +32,16 @@ from eddies.particles.remembered_velocity import RememberedVelocity
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import CubicSpline
 from eddies.pipeline import STAGES
-from eddies.scene.scene import BOX_LENGTH, Scene
+from eddies.scene.scene import BOX_LENGTH, Reconstruction, Scene, Tracers
 from eddies.scene.sections import NEIGHBORS, RECONSTRUCTED
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
+from eddies.workflows.ground_truth.flow_run import restored_modes, saved_modes
 from eddies.workflows.ground_truth.track_frames import TrackFrames
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import load_form
-from eddies.workflows.run_directory.fingerprints import stage_provenance
-from eddies.workflows.track_solver import NO_FILTER, best_solver, particles_on, solver_of, split, validation_error
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
+from eddies.workflows.track_solver import (HELD_OUT, NO_FILTER, best_solver, particles_on, solver_of, split,
+                                           validation_error)
 
 log = logging.getLogger("eddies")
 
@@ -52,17 +52,30 @@ class Method(Protocol):
     def of(self, particles: ParticleSet, time: float) -> Tensor:
         """The modes at a time; collective."""
 
+    def state_dict(self) -> dict[str, Any]:
+        """What the next frame needs of those before: tensors of modes, and plain values."""
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore that."""
+
 
 class LeastSquaresMethod:
     """The solver of each frame alone; it starts from the modes of the frame before."""
 
     def __init__(self, solver: ResolvedVelocity) -> None:
-        self._solver, self._near = solver, None
+        self._solver = solver
+        self._near: Tensor | None = None
 
     @torch.no_grad()
     def of(self, particles: ParticleSet, time: float) -> Tensor:
         self._near = self._solver.of(particles, near=self._near).velocity
         return self._near
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"modes": self._near}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self._near = state["modes"]
 
 
 class NeighbourMethod:
@@ -76,40 +89,147 @@ class NeighbourMethod:
         slab = self._grid.decomposition
         field = ParticleField(slab, self._form.support, particles.position, particles.velocity)
         velocity = self._form.of(field).velocity_on_grid().T.reshape(3, slab.count, slab.planes, slab.planes)
-        mean = torch.from_numpy(np.asarray(as_numpy(mean_over_ranks(slab.comm, particles.velocity))))
-        return self._grid.to_modes(velocity.to(self._grid.dtype) - mean.to(self._grid.dtype)[:, None, None, None])
+        mean = mean_over_ranks(slab.comm, particles.velocity).to(self._grid.dtype)
+        return self._grid.to_modes(velocity.to(self._grid.dtype) - mean[:, None, None, None])
+
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        pass
 
 
-class ParticleRows:
-    """Writes quantities at the particles of each frame to particles/tracks, in the layout of H5MD; collective.
+class Source:
+    """The particles of all frames, of measured tracks or of a ground truth; all ranks make one.
 
-    Rows are sorted by id. Frames with fewer particles than `most` end with rows of the id -1.
+    Parameters
+    ----------
+    times : of the frames. spacing : mean distance of the particles. most : largest number of particles of a frame.
+    truth : the ground truth with true fields; None for measured tracks.
+    unit, corner : of length, and the place of the origin of the tracks in the cube.
     """
 
-    def __init__(self, comm: Comm, file: File, most: int, wanted: tuple[str, ...], unit: float,
-                 corner: np.ndarray) -> None:
-        self._comm, self._most, self._unit, self._corner = comm, most, unit, corner
-        write_h5md_header(file)
-        group = file.create_group("particles/tracks")
-        write_attributes(group.create_group("box"), {"dimension": 3, "edge": BOX_LENGTH * unit})
-        self._time = growing_dataset(group, "time", (), np.float64)
-        shapes = {"id": (), "position": (3,), **{name: (RECONSTRUCTED[name],) for name in wanted}}
-        self._columns = {name: growing_dataset(group, f"{name}/value", (most, *shape), np.int64 if name == "id" else
-                                               np.float32) for name, shape in shapes.items()}
+    def __init__(self, scene: Scene, file: File, comm: Comm) -> None:
+        self._tracks, self.truth = None, None
+        if scene.tracks is not None:
+            self._tracks = source = TrackFrames(comm, scene.tracks)
+            self.times, self.spacing, self.most = source.times, source.spacing, source.most
+            self.unit, self.corner = source.about["length_unit"], source.about["corner"]
+            planes = scene.tracers.with_count(round((BOX_LENGTH / self.spacing) ** 3)).planes
+            self.slab = SlabDecomposition(comm, BOX_LENGTH, planes)
+        else:
+            self.slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)
+            self.truth = truth = GroundTruth(file, self.slab)
+            self.times, self.spacing, self.most = truth.times, scene.tracers.spacing, truth.total
+            self.unit, self.corner = 1.0, np.zeros(3)
 
-    def append(self, time: float, particles: ParticleSet, values: Mapping[str, np.ndarray]) -> None:
-        """Add a frame: the particles of this rank and the values at them."""
-        columns = {"id": as_numpy(particles.id), "position": as_numpy(particles.position) * self._unit - self._corner,
-                   **values}
-        append_frame(self._time, np.array(time), ())
-        for name, dataset in self._columns.items():
-            parts, ids = self._comm.gather(columns[name]), self._comm.gather(columns["id"])
-            block = np.zeros((0, *dataset.shape[2:]))
-            if parts is not None:
-                block = np.full((self._most, *dataset.shape[2:]), -1 if name == "id" else 0.0)
-                order = np.argsort(np.concatenate(ids))
-                block[:len(order)] = np.concatenate(parts)[order]
-            append_frame(dataset, block, (0,) * (dataset.ndim - 1))
+    def particles(self, frame: int) -> ParticleSet:
+        """This rank's particles of a frame, with position and velocity; collective."""
+        if self._tracks is not None:
+            return particles_on(self.slab, self._tracks.frame(frame))
+        columns = self.truth.particles(frame)
+        return ParticleSet.from_numpy({name: columns[name] for name in ("id", "position", "velocity")})
+
+
+class ReconstructionRun:
+    """Reconstructs frame after frame into segments, from the start or from a checkpoint.
+
+    Parameters
+    ----------
+    source : the particles. methods : of all particles and, if some are left out, of the others.
+    solver : whose grid has the modes. settings, tracers : [reconstruction] and [tracers].
+    viscosity, transfer : nu, and G of the filter that the particles follow.
+    """
+
+    def __init__(self, source: Source, methods: Sequence[Method], solver: ResolvedVelocity, settings: Reconstruction,
+                 tracers: Tracers, viscosity: float, transfer: Tensor) -> None:
+        self.source, self.methods, self.solver, self.grid = source, methods, solver, solver.grid
+        self.settings, self.tracers, self.viscosity, self.transfer = settings, tracers, viscosity, transfer
+        self.frames = range(0, len(source.times), settings.every)
+        cells = settings.cells or tracers.cells
+        self.target = SpectralGrid(SlabDecomposition(source.slab.comm, BOX_LENGTH, cells), cutoff=(cells - 1) // 2)
+        self.errors: list[dict[str, float]] = []
+        self.of_fields: list[dict[str, float]] = []
+
+    @property
+    def steps(self) -> int:
+        """Number of frames so far."""
+        return len(self.errors)
+
+    @property
+    def layout(self) -> FrameLayout:
+        """The datasets of the frames. A row of `tracks` belongs to the track in its column `track`, or to none (-1)."""
+        values = {name: RECONSTRUCTED[name] for name in self.settings.fields}
+        columns = {"track": (), "coordinates": (3,), **{name: (count,) for name, count in values.items()}}
+        tracks = {"tracks": TrajectoryLayout(self.source.most, columns)} if self.settings.particles else {}
+        return FrameLayout(BOX_LENGTH, tracks, np.float64,
+                           {"reconstructed": FieldLayout(self.target.decomposition.planes, values)})
+
+    def run(self, guard: Guard, segments: FrameSegments) -> None:
+        """Reconstruct the frames that are left."""
+        progress = ProgressLine("reconstruct", lambda: self.settings.method, done=self.steps / len(self.frames),
+                                unit="frame")
+        while self.steps < len(self.frames):
+            guard(self, segments)
+            segments.open(self.steps)
+            self._next(segments)
+            progress(self.steps / len(self.frames), self.steps)
+
+    def _next(self, segments: FrameSegments) -> None:
+        frame, comm = self.frames[self.steps], self.source.slab.comm
+        time, particles, began = float(self.source.times[frame]), self.source.particles(frame), perf_counter()
+        modes = self.methods[0].of(particles, time)
+        row = {"time": time, "seconds": perf_counter() - began}
+        mean = as_numpy(mean_over_ranks(comm, particles.velocity))
+        made = Quantities(modes, mean, self.transfer, self.viscosity, self.grid, self.settings.fields, self.source.unit)
+        segments.fields["reconstructed"].append(time, self.target.decomposition.start, made.on(self.target))
+        if self.settings.particles:
+            place = as_numpy(particles.position) * self.source.unit - self.source.corner
+            rows = sorted_rows(comm, self.source.most, {
+                "track": as_numpy(particles.id), "coordinates": place, **made.at(particles)})
+            segments.trajectories["tracks"].append(frame, time, 0 if comm.rank == 0 else self.source.most, rows)
+        if len(self.methods) > 1:
+            known, apart = split(particles, self.settings.holdout)
+            row["validation_error"] = validation_error(self.solver, self.methods[1].of(known, time), known, apart)
+        if self.source.truth is not None and frame in self.source.truth.at_fields:
+            self.of_fields.append({"time": time, **errors_of(modes, mean, self.tracers, self.grid, self.source.truth,
+                                                             frame)})
+        self.errors.append(row)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The state for a checkpoint, besides the files of the frames."""
+        state: dict[str, Any] = {"reconstruct": {"errors": self.errors, "of_fields": self.of_fields, "plain": []}}
+        for number, method in enumerate(self.methods):
+            plain = {}
+            for name, value in method.state_dict().items():
+                if isinstance(value, Tensor):
+                    state[f"{name}-{number}"] = saved_modes(self.grid.spectral, as_numpy(value.resolve_conj()))
+                else:
+                    plain[name] = value
+            state["reconstruct"]["plain"].append(plain)
+        return state
+
+    def load_state_dict(self, saved: Checkpoint) -> None:
+        """Continue from a checkpoint, made on any number of ranks."""
+        state = saved["reconstruct"]
+        self.errors, self.of_fields = state["errors"], state["of_fields"]
+        for number, method in enumerate(self.methods):
+            modes = {name: torch.from_numpy(restored_modes(self.grid.spectral, saved, dimensions, f"{name}-{number}"))
+                     for name, dimensions in (("modes", 4), ("penalty", 3)) if f"{name}-{number}" in saved}
+            method.load_state_dict({**state["plain"][number], **modes})
+
+
+def sorted_rows(comm: Comm, most: int, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """All rows on rank 0, sorted by track and filled up to `most` rows with the track -1; none on other ranks."""
+    parts = comm.gather(dict(columns))
+    if parts is None:
+        return {name: values[:0] for name, values in columns.items()}
+    whole = {name: np.concatenate([part[name] for part in parts]) for name in columns}
+    order, rows = np.argsort(whole["track"]), {}
+    for name, values in whole.items():
+        rows[name] = np.full((most, *values.shape[1:]), -1.0 if name == "track" else 0.0)
+        rows[name][:len(order)] = values[order]
+    return rows
 
 
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
@@ -117,80 +237,46 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
 
     With u the velocity of the tracks, u* = u / G that before their filter, if they follow a filtered one, and P the
     projection on solenoidal fields, the acceleration along a track is  -G P[div(u* u*)] + nu laplacian u + div(u u),
-    and the pressure G p[u*]. All are those of the modes that particles resolve, in the units of the tracks.
+    and the pressure G p[u*]. All are those of the modes that particles resolve, in the units of the tracks. A stopped
+    reconstruction continues from its newest checkpoint.
     """
     prepare_torch("cpu", comm)
     settings, tracers, directory = scene.reconstruction, scene.tracers, Path(directory)
-    with ExitStack() as files:
-        truth_file = files.enter_context(open_product(comm, directory / STAGES["dns"].file, "ground_truth"))
-        reference, unit, corner = read_attributes(truth_file, "reference"), 1.0, np.zeros(3)
-        truth, source = None, None
-        if scene.tracks is not None:
-            source = TrackFrames(comm, scene.tracks)
-            times, count = source.times, (BOX_LENGTH / source.spacing) ** 3
-            unit, corner = source.about["length_unit"], source.about["corner"]
-        slab = SlabDecomposition(comm, BOX_LENGTH, tracers.planes)
-        if source is None:
-            truth = GroundTruth(truth_file, slab)
-            times, count = truth.times, truth.total
-        else:
-            slab = SlabDecomposition(comm, BOX_LENGTH, tracers.with_count(round(count)).planes)
-
-        def particles(frame: int) -> ParticleSet:
-            if source is not None:
-                return particles_on(slab, source.frame(frame))
-            return ParticleSet.from_numpy({name: values for name, values in truth.particles(frame).items()
-                                           if name != "density"})
-
-        spacing = BOX_LENGTH / count ** (1 / 3)
-        width = tracers.filter_width if tracers.filtered else NO_FILTER * spacing
-        solver, weight, error = best_solver(particles(0), partial(
-            solver_of, slab, reference | {"spacing": spacing, "filter_width": width}), settings.holdout or 0.1)
-        grid, frames = solver.grid, range(0, len(times), settings.every)
+    guard = Guard(comm, directory / STAGES["reconstruct"].checkpoints, stage_fingerprint(scene, "reconstruct"), stop,
+                  " of the reconstruction")
+    with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as file:
+        source, reference = Source(scene, file, comm), read_attributes(file, "reference")
+        width = tracers.filter_width if tracers.filtered else NO_FILTER * source.spacing
+        solver, weight, _ = best_solver(source.particles(0), partial(
+            solver_of, source.slab, reference | {"spacing": source.spacing, "filter_width": width}),
+            settings.holdout or HELD_OUT)
+        grid = solver.grid
         transfer = grid.filter_transfer(tracers.filter_width) if tracers.filtered else torch.ones_like(grid.shell)
-        make = _maker(scene, comm, directory, solver, weight, transfer, truth)
-        methods = [make(), make()] if settings.holdout > 0 else [make()]
-        cells = settings.cells or tracers.cells
-        target = SpectralGrid(SlabDecomposition(comm, BOX_LENGTH, cells), cutoff=(cells - 1) // 2)
-        progress = ProgressLine("reconstruct", lambda: settings.method, unit="frame")
-        rows: list[dict[str, float]] = []
-        compared: list[dict[str, float]] = []
-        with create_product(comm, directory / STAGES["reconstruct"].file, "reconstruction",
-                            stage_provenance(scene, "reconstruct")) as file:
-            writer = FieldWriter(file, "reconstructed", cells, {name: RECONSTRUCTED[name] for name in settings.fields})
-            rows_of_particles = None
-            if settings.particles:
-                most = truth.total if truth is not None else source.most
-                rows_of_particles = ParticleRows(comm, file, most, settings.fields, unit, corner)
-            for number, frame in enumerate(frames):
-                if stop is not None:
-                    stop.check()
-                now, began = particles(frame), time.perf_counter()
-                modes = methods[0].of(now, float(times[frame]))
-                row = {"time": float(times[frame]), "seconds": time.perf_counter() - began}
-                mean = as_numpy(mean_over_ranks(comm, now.velocity))
-                made = Quantities(modes, mean, transfer, reference["viscosity"], grid, settings.fields, unit)
-                writer.append(times[frame], target.decomposition.start, made.on(target))
-                if rows_of_particles is not None:
-                    rows_of_particles.append(float(times[frame]), now, made.at(now))
-                if settings.holdout > 0:
-                    known, apart = split(now, settings.holdout)
-                    row["validation_error"] = validation_error(solver, methods[1].of(known, float(times[frame])), known,
-                                                               apart)
-                rows.append(row)
-                if truth is not None and frame in truth.at_fields:
-                    compared.append({"time": row["time"], **errors_of(
-                        modes, mean, tracers.filtered, tracers.filter_width, grid, truth, frame)})
-                progress((number + 1) / len(frames), number + 1)
-            for name, table in (("errors_over_time", rows), ("errors_of_fields", compared)):
-                if table:
-                    write_table(file, name, {key: np.array([row[key] for row in table]) for key in table[0]})
-            write_attributes(file.create_group("about"), {
-                "method": settings.method, "particles": float(count), "weight": weight, "length_unit": unit,
-                "corner": corner, "holdout": settings.holdout, "highest_wavenumber": grid.resolved})
+        make = _maker(scene, comm, directory, solver, weight, transfer, source.truth)
+        whole = ReconstructionRun(source, [make() for _ in range(2 if settings.holdout > 0 else 1)], solver, settings,
+                                  tracers, reference["viscosity"], transfer)
+        saved = guard.checkpoints.newest()
+        if saved is not None:
+            whole.load_state_dict(saved)
+            log.info("reconstruct: continues from frame %d", whole.steps)
+        before = () if saved is None else saved.files
+        with FrameSegments(comm, guard.checkpoints.path, whole.layout, before) as segments:
+            whole.run(guard, segments)
+            with create_product(comm, directory / STAGES["reconstruct"].file, "reconstruction",
+                                stage_provenance(scene, "reconstruct")) as product:
+                segments.assemble(product)
+                tables = {"errors_over_time": whole.errors, "errors_of_fields": whole.of_fields}
+                for name, table in tables.items():
+                    if table:
+                        write_table(product, name, {key: np.array([row[key] for row in table]) for key in table[0]})
+                write_attributes(product.create_group("about"), {
+                    "method": settings.method, "particles": (BOX_LENGTH / source.spacing) ** 3, "weight": weight,
+                    "length_unit": source.unit, "corner": source.corner, "holdout": settings.holdout,
+                    "highest_wavenumber": grid.resolved})
+    guard.checkpoints.remove()
     log.info("reconstruct: %s; means over time: %s", settings.method, ", ".join(
         f"{key.replace('_', ' ')} {np.mean([row[key] for row in table]):.3g}"
-        for table in (rows, compared) if table for key in table[0] if key != "time"))
+        for table in tables.values() if table for key in table[0] if key != "time"))
 
 
 def _maker(scene: Scene, comm: Comm, directory: Path, solver: ResolvedVelocity, weight: float,
@@ -262,13 +348,13 @@ class Quantities:
         return {name: found[name] for name in self.wanted}
 
 
-def errors_of(modes: Tensor, mean: np.ndarray, filtered: bool, filter_width: float, grid: FourierGrid,
-              truth: GroundTruth, frame: int) -> Mapping[str, float]:
+def errors_of(modes: Tensor, mean: np.ndarray, tracers: Tracers, grid: FourierGrid, truth: GroundTruth,
+              frame: int) -> dict[str, float]:
     """Normalised L2 errors of the filtered velocity and its gradient at a frame whose field the ground truth has."""
     slab = SlabDecomposition(grid.decomposition.comm, BOX_LENGTH, truth.fields.cells)
     target = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
     exact = truth.planes(truth.fields, truth.at_fields.index(frame), "velocity", slab)
-    given = modes if filtered else modes * grid.filter_transfer(filter_width)
+    given = modes if tracers.filtered else modes * grid.filter_transfer(tracers.filter_width)
     found = {"velocity": target.backward(regrid(grid.spectral, target, as_numpy(given.resolve_conj())))
              + mean[:, None, None, None]}
     errors = {"velocity": (found["velocity"], exact)}

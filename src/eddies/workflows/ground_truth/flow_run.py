@@ -292,7 +292,7 @@ def saved_modes(grid: SpectralGrid, modes: np.ndarray) -> Block:
     return Block(modes, int(grid.column_starts[grid.decomposition.rank]), grid.modes, axis=modes.ndim - 2)
 
 
-def restored_modes(grid: SpectralGrid, saved: Checkpoint, dimensions: int) -> np.ndarray:
-    """The part of this rank in the block "modes" of a checkpoint, an array of so many dimensions."""
+def restored_modes(grid: SpectralGrid, saved: Checkpoint, dimensions: int, name: str = "modes") -> np.ndarray:
+    """The part of this rank in a block of modes of a checkpoint, an array of so many dimensions."""
     start, stop = grid.column_starts[grid.decomposition.rank:][:2]
-    return saved.read("modes", int(start), int(stop), axis=dimensions - 2)
+    return saved.read(name, int(start), int(stop), axis=dimensions - 2)
