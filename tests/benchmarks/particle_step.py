@@ -82,7 +82,7 @@ class Run:
         scales = turbulence_scales(energy_spectrum(grid, modes)[1], 0.0, 0.0, grid.cutoff)
         self.speed, self.turnover = scales["velocity_rms"], scales["eddy_turnover_time"]
         slab = SlabDecomposition(comm, 2 * math.pi, tracers.planes)
-        columns = release(slab, 1, side, "random")
+        columns = release(slab, 1, side**3, "random")
         columns["velocity"] = self._velocity(grid, modes, columns["position"])
         self.particles = ParticleSet.from_numpy(columns)
         flow = FlowUnits(ReferenceScales(filter_width=width, spacing=tracers.spacing, velocity=self.speed,

@@ -68,7 +68,7 @@ def frame_of(comm, model, wind=0.0):
     They have a density if the model integrates one.
     """
     slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
-    columns = release(slab, 3, PER_SIDE, "random")
+    columns = release(slab, 3, PER_SIDE**3, "random")
     x, y, z = columns["position"].T
     velocity = np.stack([np.sin(y) + 0.4 * np.cos(z), np.sin(z), np.sin(x)], axis=1)
     density = 1 + 0.01 * np.cos(x) * np.cos(y)

@@ -24,7 +24,7 @@ def flow(x):
 
 def sample_of(comm, support):
     slab = SlabDecomposition(comm, LENGTH, CELLS)
-    position = torch.from_numpy(release(slab, 3, PER_SIDE, "random")["position"])
+    position = torch.from_numpy(release(slab, 3, PER_SIDE**3, "random")["position"])
     particle_field = ParticleField(slab, support, position, flow(position)[0], torch.float64)
     return KernelSample(particle_field, *flow(grid_points(slab, CELLS)))
 

@@ -37,7 +37,7 @@ def solving(resolved, iterations):
 
 def window_of(slab, with_density):
     """Particles in a smooth flow that changes slowly, with true velocities and energies."""
-    columns = release(slab, 3, PER_SIDE, "random")
+    columns = release(slab, 3, PER_SIDE**3, "random")
     x, y, z = columns["position"].T
 
     def velocity(turned):

@@ -23,7 +23,7 @@ class FrozenTurbulence:
         field = FilteredField(grid, 2 * LENGTH / PER_SIDE, "cubic")
         self.filtered = energy_spectrum(grid, field.transfer * state)[1]
         self.times = STEP * np.arange(FRAMES)
-        tracers = TracerParticles(field, release(grid.decomposition, 3, PER_SIDE, "random"), state)
+        tracers = TracerParticles(field, release(grid.decomposition, 3, PER_SIDE**3, "random"), state)
         self.frames = []
         for _ in self.times:
             order = np.argsort(tracers.columns["id"])
