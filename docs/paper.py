@@ -1,0 +1,259 @@
+"""Draws the figures of paper.md from four runs: the flow of the training, and unseen ones at three Mach numbers.
+
+    .venv/bin/python docs/paper.py training=runs/paper-256 mt008=runs/paper-256-unseen mt016=runs/paper-256-mt016 \
+        mt004=runs/paper-256-mt004
+
+Numbers of figures are those of the paper. Figures 4 to 7 show mt016, Fig. 8 mt016 and mt008. Figures of runs that are
+not given are left as they are; Fig. 3 takes their numbers from results/paper-a-priori.json, and tables of paper.md from
+results/paper-NAME.json, which are written here.
+"""
+
+import io
+import json
+import shutil
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+from PIL import Image
+
+from eddies import open_run
+from eddies.analysis.against_truth import EDGES, conditional_flows, last_invariants, pdf_divergence
+from eddies.analysis.pdfs import bin_edges, bin_probabilities, gaussian, kl_divergence, pdf, standardized
+from eddies.analysis.rollout import Rollout
+from eddies.report.figures import (BAR, DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SECOND, SIGNED, THIRD, TRUTH,
+                                   colour_bar, guide_power_law, largest, legend_at_foot, letter, note,
+                                   number_wavenumbers, panels, png, show_plane, styled)
+from eddies.report.rollout_figures import invariant_plane
+from eddies.stored_run import StoredRun
+from eddies.workflows.rollout.measured import open_rollout
+
+HERE = Path(__file__).parent / "paper"
+# Variants in the figures: label, line.
+MODELS = {"paper-forced": ("paper, forced", {"color": FOURTH, "linestyle": "-."}),
+          "paper": ("paper", {"color": MODEL}),
+          "resolved": ("resolved", {"color": SECOND, "linestyle": "--"}),
+          "local": ("local", {"color": THIRD, "linestyle": ":"})}
+BEFORE = bin_edges(8, 65)  # bins of Fig. 3, in standard deviations
+NAMES = "training", "mt008", "mt016", "mt004"
+NUMBERS = Path(__file__).parent / "results/paper-a-priori.json"
+COLOURS, WIDTH = 80, 1200  # of a picture in the documentation
+
+
+def mach_number(run: StoredRun) -> float:
+    """M_t of the flow when the tracers are released."""
+    return run.metrics["ground_truth"]["mach_turbulent"]
+
+
+def numbers_of(run: StoredRun) -> dict:
+    """What Fig. 3 shows of a run: errors at the true state over time, and PDFs of accelerations at the last time."""
+    tables = {name: run.variant(name)["model/a_priori"] for name in ("paper", "resolved", "local")}
+    sample = run.variant("paper")["model/acceleration_sample"]
+    truth, predicted = (standardized(np.asarray(sample[name]), np.asarray(sample["truth"])) for name in (
+        "truth", "predicted"))
+    own = tables["paper"]
+    return {"mach": mach_number(run), "delay": own["delay"].values.tolist(),
+            "pressure_gradient": own["pressure_gradient_error"].values.tolist(),
+            "models": {name: table["acceleration_error"].values.tolist() for name, table in tables.items()},
+            "pdfs": [pdf(values, BEFORE).tolist() for values in (truth, predicted)],
+            "divergence": kl_divergence(*(bin_probabilities(values, BEFORE) for values in (truth, predicted)))}
+
+
+@styled
+def figure_3(numbers: dict[str, dict]):
+    """Draw errors at the true state over delay and Mach number, and PDFs of the acceleration."""
+    figure, axes = panels(2, 3, (3.6, 2.9), foot=0.3)
+    delay, machs, *shown = axes.flat
+    training = numbers["training"]
+    for name in training["models"]:
+        label, line = MODELS[name]
+        delay.plot(training["delay"], training["models"][name], label=label, **line)
+        found = sorted((each["mach"], np.mean(each["models"][name])) for key, each in numbers.items()
+                       if key != "training")
+        machs.plot(*np.transpose(found), marker="o", **line)
+    delay.plot(training["delay"], training["pressure_gradient"], color=GUIDE, label="exact filtered pressure gradient")
+    delay.axvspan(min(training["delay"]), 0, color="#eeeeee")
+    delay.set(xlabel="time after the training window", ylabel="acceleration error", ylim=(0, None),
+              title="flow of the training")
+    machs.set(xlabel="$M_t$", ylim=(0, None), title="unseen flows, mean over time")
+    centres = (BEFORE[1:] + BEFORE[:-1]) / 2
+    for axis, (key, each) in zip(shown, numbers.items()):
+        lines = {"color": TRUTH}, {"color": MODEL, "linestyle": "none", "marker": "o", "markersize": 3,
+                                   "markerfacecolor": "none"}
+        for density, line in zip(np.array(each["pdfs"]), lines):
+            axis.semilogy(centres, np.where(density > 0, density, np.nan), **line)
+        axis.semilogy(centres, gaussian(centres), color=GUIDE, linestyle=":")
+        seen = "training flow, later" if key == "training" else "unseen"
+        axis.set(title=f"$M_t = {each['mach']:.2f}$, {seen}", xlabel="$a$ / standard deviation", ylim=(1e-5, 2),
+                 ylabel="PDF")
+    for axis in shown[len(numbers):]:
+        axis.remove()
+    legend_at_foot(figure, delay, 4)
+    letter([*axes.flat][:2 + len(numbers)])
+    return figure
+
+
+@styled
+def figure_4(rollouts: dict[str, Rollout]):
+    """Draw u_x in the plane z = pi over time: true tracers above, models below."""
+    figure, axes = panels(1 + len(rollouts), 4, (2.0, 2.0), right=BAR, sharex=True, sharey=True)
+    first = next(iter(rollouts.values()))
+    shown = first.common.spread(4)
+    rows = {"true tracers": [first.planes["truth"][first.common.truth[index]] for index in shown]}
+    for name, run in rollouts.items():
+        rows[MODELS[name][0]] = [run.planes["model"][run.common.model[index]] for index in shown]
+    limit = largest(*(plane.velocity[0] for plane in rows["true tracers"]))
+    for row, (name, planes) in zip(axes, rows.items()):
+        for axis, plane in zip(row, planes):
+            image = show_plane(axis, plane.velocity[0], (-limit, limit), SIGNED)
+        row[0].set_ylabel(f"{name}\n$y$")
+    for axis, index in zip(axes[0], shown):
+        axis.set_title(f"$t = {first.common.times[index] / first.turnover:.2f}\\,T$")
+    for axis in axes[-1]:
+        axis.set_xlabel("$x$")
+    colour_bar(figure, image, axes.flat, "$u_x$")
+    return figure
+
+
+@styled
+def figure_5(rollouts: dict[str, Rollout]):
+    """Draw vorticity and kinetic energy in the plane z = pi at the end: true tracers, then models."""
+    figure, axes = panels(2, 1 + len(rollouts), (2.0, 2.0), right=BAR, sharex=True, sharey=True)
+    first = next(iter(rollouts.values()))
+    planes = {"true tracers": first.planes["truth"][first.common.truth[-1]]}
+    planes |= {MODELS[name][0]: run.planes["model"][run.common.model[-1]] for name, run in rollouts.items()}
+    energy = {name: np.sum(plane.velocity**2, axis=0) / 2 for name, plane in planes.items()}
+    rotation = {name: plane.vorticity for name, plane in planes.items()}
+    for row, found, label in zip(axes, (rotation, energy), (r"$|\omega|$", r"$\frac{1}{2}|u|^2$")):
+        limit = largest(found["true tracers"])
+        for axis, (name, plane) in zip(row, found.items()):
+            image = show_plane(axis, plane, (0, limit), POSITIVE)
+        colour_bar(figure, image, row, label, extend="max")
+        row[0].set_ylabel("$y$")
+    for axis, name in zip(axes[0], planes):
+        axis.set_title(name)
+    for axis in axes[1]:
+        axis.set_xlabel("$x$")
+    return figure
+
+
+@styled
+def figure_6(rollouts: dict[str, Rollout]):
+    """Draw PDFs of velocity and acceleration of the particles at three times, in units of the truth's deviation."""
+    figure, axes = panels(2, 3, (3.5, 2.7), foot=0.3, sharex="row", sharey="row")
+    first = next(iter(rollouts.values()))
+    for row, (quantity, edges) in zip(axes, EDGES.items()):
+        centres = (edges[1:] + edges[:-1]) / 2
+        for axis, index in zip(row, first.common.spread(4)[1:]):
+            truth = first.pair(index, quantity).truth
+            lines = [("true tracers", {"color": TRUTH, "linewidth": 2.4}, truth)]
+            lines += [(*MODELS[name], run.pair(index, quantity).model) for name, run in rollouts.items()]
+            for label, line, values in lines:
+                density = pdf(standardized(values, truth), edges)
+                axis.semilogy(centres, np.where(density > 0, density, np.nan), label=label, **line)
+            axis.semilogy(centres, gaussian(centres), color=GUIDE, linestyle=":", linewidth=1, label="Gaussian")
+            divergence = pdf_divergence(rollouts["paper"].pair(index, quantity), edges)
+            time = first.common.times[index] / first.turnover
+            axis.set_title(f"$t = {time:.2f}\\,T$,  KL of paper {divergence:.2g}")
+            axis.set(xlabel=f"${quantity[0]}$ / standard deviation of the truth",
+                     ylim=(0.4 / truth.size / (edges[1] - edges[0]), 2))
+        row[0].set_ylabel(f"{quantity} PDF")
+    legend_at_foot(figure, axes[0, 0], 6)
+    letter(axes.flat)
+    return figure
+
+
+@styled
+def figure_8(rows: list[tuple[str, dict[str, Rollout], dict[str, StoredRun]]]):
+    """Draw energy spectra at the start, the middle and the end; a row for each flow.
+
+    Spectra of particles are those of the field that the learned kernel reconstructs, as in the paper.
+    """
+    figure, axes = panels(len(rows), 3, (3.5, 3.1), foot=0.3, sharex=True, sharey=True)
+    for row, (title, rollouts, stored) in zip(axes, rows):
+        first = next(iter(rollouts.values()))
+        flow, cutoff = first.flow, first.filter_wavenumber
+        known = flow["wavenumber"] >= 1
+        for axis, index in zip(row, first.common.spread(3)):
+            time = first.common.times[index]
+            nearest = int(np.argmin(np.abs(flow["time"] - (first.start_time + time))))
+            for column, line in (("energy", {"color": DNS, "label": "DNS"}),
+                                 ("filtered", {"color": FILTERED, "label": "filtered DNS"})):
+                axis.loglog(flow["wavenumber"][known], flow[column][nearest][known], linewidth=1.2, **line)
+            draw_spectrum(axis, next(iter(stored.values())).field(time=time, of="truth"), cutoff, label="true tracers",
+                          color=TRUTH)
+            for name, run in stored.items():
+                draw_spectrum(axis, run.field(time=time, of="model"), cutoff, label=MODELS[name][0], **MODELS[name][1])
+            axis.axvline(cutoff, color=GUIDE, linestyle=":", linewidth=1)
+            note(axis, r"$\pi/d$", (cutoff, 0.01), ("data", "axes fraction"), (3, 1))
+            axis.set_title(f"{title}, $t = {time / first.turnover:.2f}\\,T$")
+            number_wavenumbers(axis)
+        row[0].set_ylabel("$E(k)$")
+    for axis in axes[-1]:
+        axis.set_xlabel("wavenumber $k$")
+    peak = max(flow["energy"].max(axis=0))
+    guide_power_law(axes[0, 0], (2, 10), 2.2 * peak, -5 / 3, r"$k^{-5/3}$")
+    axes[0, 0].set(ylim=(1e-5 * peak, 6 * peak), xlim=(0.9, 85))
+    legend_at_foot(figure, axes[0, 0], 7)
+    letter(axes.flat)
+    return figure
+
+
+def draw_spectrum(axis, field, cutoff: float, **line) -> None:
+    """Draw the spectrum of a field (3, n, n, n) up to k_d, summed over shells of unit width."""
+    field = np.asarray(field, dtype=float)
+    cells = field.shape[-1]
+    modes = np.fft.fftn(field, axes=(1, 2, 3)) / cells**3
+    numbers = np.fft.fftfreq(cells, 1 / cells)
+    shell = np.rint(np.sqrt(sum(part**2 for part in np.meshgrid(numbers, numbers, numbers)))).astype(int)
+    energy = np.bincount(shell.ravel(), (np.sum(np.abs(modes)**2, axis=0) / 2).ravel())
+    wavenumber = np.arange(1, int(cutoff) + 1)
+    axis.loglog(wavenumber, energy[wavenumber], **line)
+
+
+def save(name: str, figure) -> None:
+    """Write a picture with few colours."""
+    HERE.mkdir(exist_ok=True)
+    image = Image.open(io.BytesIO(png(figure))).convert("RGB")
+    image.thumbnail((WIDTH, 2 * WIDTH))
+    image.quantize(COLOURS).save(HERE / f"{name}.png", optimize=True)
+
+
+def main(arguments: list[str]) -> None:
+    """Draw the figures of the runs that are given as NAME=RUN, and write their numbers."""
+    runs = {name: open_run(path) for name, path in (argument.split("=") for argument in arguments)}
+    numbers = json.loads(NUMBERS.read_text(encoding="utf-8")) if NUMBERS.exists() else {}
+    numbers |= {name: numbers_of(run) for name, run in runs.items()}
+    numbers = {name: numbers[name] for name in NAMES if name in numbers}
+    NUMBERS.write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
+    for name, run in runs.items():
+        if name == "training":
+            continue
+        shutil.copy(run.path / "report/variants.json", NUMBERS.parent / f"paper-{name}.json")
+    save("figure-3", figure_3(numbers))
+    if "training" in runs:
+        drawn = runs["training"].variant("paper").figures
+        save("figure-1", drawn["figure-1-kernels"])
+        save("figure-2", drawn["figure-2-reconstruction"])
+    if not {"mt008", "mt016"} <= {*runs}:
+        return
+    with ExitStack() as files:
+        opened = {name: {variant: files.enter_context(open_rollout(runs[name].variant(variant).path,
+                                                                   MPI.COMM_SELF)).rollout for variant in MODELS}
+                  for name in ("mt016", "mt008")}
+        rollouts = opened["mt016"]
+        save("figure-4", figure_4(rollouts))
+        save("figure-5", figure_5(rollouts))
+        save("figure-6", figure_6(rollouts))
+        run = rollouts["paper-forced"]
+        statistics = last_invariants(run)
+        save("figure-7", invariant_plane(statistics, conditional_flows(run, statistics.bins)))
+        save("figure-8", figure_8([(f"$M_t = {mach_number(runs[name]):.2f}$", found,
+                                    {variant: runs[name].variant(variant) for variant in MODELS})
+                                   for name, found in opened.items()]))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
