@@ -68,7 +68,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
         ProductError: an input is missing that `stages` do not make.
         VariantsFailed: variants failed; the products of the others are complete.
     """
-    if scene.tracks is not None:
+    if scene.of_tracks:
         from eddies.workflows.tracks import with_tracks  # imports torch
         scene = with_tracks(scene, comm)
     settings = [scene.to_toml(), *(stage_fingerprint(scene, stage) for stage in scene.stages), str(directory), *stages,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from eddies.io.errors import ProductError
-from eddies.io.track_files import Tracks, check_box, read_tracks, write_tracks
+from eddies.io.track_files import Tracks, check_inside, check_velocities, checked, read_tracks, write_tracks
 
 pytestmark = pytest.mark.mpi(1)
 
@@ -42,7 +42,7 @@ def test_tracks_that_are_written_are_read_in_any_order(tmp_path):
     found = read_tracks(tmp_path / "t.h5")
     assert_same(found, rows)
     assert found.edge == EDGE
-    check_box(found, EDGE, "t.h5")
+    check_velocities(found, EDGE, "t.h5")
 
 
 def test_a_table_of_a_tracking_program(tmp_path):
@@ -100,7 +100,7 @@ def changed(rows, **changes):
 
 @pytest.mark.parametrize("changes, words", [
     ({"positions": np.nan}, "position of track .* not finite"), ({"times": np.inf}, "time of track .* not finite"),
-    ({"ids": 1, "times": 0.0}, "track 1 is there twice at time 0"), ({"ids": -5}, "whole numbers, 0 or larger")])
+    ({"ids": 1, "times": 0.0}, "track 1 is there twice at time 0"), ({"ids": -5}, "whole numbers from 0")])
 def test_rows_that_are_none_are_refused_before_anything_is_written(tmp_path, changes, words):
     with pytest.raises(ProductError, match=words):
         write_tracks(tmp_path / "t.h5", **changed(shear(np.array([0.0, 0.1, 0.2])), **changes))
@@ -131,8 +131,9 @@ def test_times_that_do_not_increase(tmp_path):
 def test_units_that_contradict_each_other():
     time, track, position, velocity = shear(np.linspace(0, 1, 11))
     tracks = Tracks(time, track, position, velocity)
-    check_box(tracks, EDGE, "f")
+    tracks = checked(tracks, "f")
+    check_velocities(tracks, EDGE, "f")
     with pytest.raises(ProductError, match="outside the box"):
-        check_box(tracks, 0.9 * EDGE, "f")
+        check_inside(tracks, np.zeros(3), np.full(3, 0.9 * EDGE), "box", "f")
     with pytest.raises(ProductError, match="0.01 times as far"):
-        check_box(Tracks(100 * time, track, position, velocity), EDGE, "f")
+        check_velocities(Tracks(100 * time, track, position, velocity), EDGE, "f")

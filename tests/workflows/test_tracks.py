@@ -92,6 +92,28 @@ def test_noise_costs_less_with_smoothing(comm, twin, tmp_path):
 
 
 @pytest.mark.mpi(1)
+def test_times_become_equal_ones_and_a_gap_is_named(comm, tmp_path):
+    """Times with the rounding of a table are snapped to frames, also where single tracks have other digits."""
+    times = 0.1 + np.arange(7) / 300
+    time, track = (part.ravel() for part in np.meshgrid(times, np.arange(30), indexing="ij"))
+    draw = np.random.default_rng(1)
+    position = draw.uniform(0, 6, (30, 3))[track] + np.outer(time, [0.1, 0.2, 0.3])
+    given = np.where(track % 3, np.round(time, 5), time)
+    write_tracks(tmp_path / "a.h5", given, track, position)
+    scene = scene_of(comm, tmp_path, f'[tracks]\npath = "a.h5"\nbox = {2 * np.pi}\n')
+    found = measured(scene.tracks)
+    np.testing.assert_allclose(found.times, np.arange(7) * 0.00333333, rtol=1e-5)
+    assert found.complete == 30
+    np.testing.assert_allclose(found.frame(2)["velocity"], np.tile([0.1, 0.2, 0.3], (30, 1)), rtol=0.05)
+    write_tracks(tmp_path / "a.h5", time[time != times[3]], track[time != times[3]], position[time != times[3]])
+    with pytest.raises(SceneError, match="no track is there at time 0.11 "):
+        measured(scene.tracks)
+    write_tracks(tmp_path / "a.h5", time + 1e-3 * (time == times[2]), track, position)
+    with pytest.raises(SceneError, match="equal intervals are needed"):
+        measured(scene.tracks)
+
+
+@pytest.mark.mpi(1)
 def test_densities_make_a_compressible_ground_truth(comm, tmp_path, twin):
     with h5py.File(twin / "ground_truth.h5") as file:
         arrays = {name: file[f"particles/tracers/{column}/value"][()] for name, column in ARRAYS.items()}
@@ -115,15 +137,17 @@ sound_speed = 15.0
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("text, error, words", [
     (SECTION, ProductError, "missing.csv: no such file"),
-    (SECTION.replace("20.0", "19.0"), ProductError, "outside the box from 0 to 19"),
+    (SECTION.replace("20.0", "19.0"), ProductError, "outside the box from .* to .19"),
     (SECTION.replace("box = 20.0", ""), SceneError, "box: this key is missing"),
     (SECTION + "sound_speed = 5.0", SceneError, "has no densities"),
     (SECTION.replace("true", "false") + "[kernel]\nsteps = 1", SceneError, "filtered = false: models are those of"),
     (SECTION + "[forcing]\ninjection_rate = 1", SceneError, "takes the place of this section"),
+    ("realisations = [1]\n" + SECTION, SceneError, "the file has one realisation"),
+    (SECTION + '[reconstruction]\nmethod = "memory"', SceneError, "viscosity: .* the method memory"),
     (SECTION + "[tracers]\ncount = 500\nturnovers = 1\nframe_interval = 1", SceneError, r"\[tracers\]: does not fit"),
     (SECTION + '[model]\npreset = "resolved"\n[training]\nframes = 2\nbatch = 10\nsteps = 1', SceneError,
      'viscosity: this key is missing, and the term "viscosity" needs it')],
-    ids=["file", "outside", "box", "density", "filtered", "forcing", "tracers", "viscosity"])
+    ids=["file", "outside", "box", "density", "filtered", "forcing", "realisations", "memory", "tracers", "viscosity"])
 def test_tracks_that_do_not_fit_are_refused(comm, twin, tmp_path, text, error, words):
     path = "missing.csv" if "missing" in words and "file" in words else twin / "tracks.csv"
     with pytest.raises(error, match=words) as caught:
@@ -171,7 +195,7 @@ learning_rate = 1e-2
 
 
 @pytest.mark.mpi(1, 2)
-def test_short_tracks_of_the_whole_flow_have_filtered_fields(comm, tmp_path):
+def test_short_tracks_of_the_whole_flow_have_filtered_fields(comm, tmp_path, no_figures):
     """No track is there all the time, and all follow the whole flow; the filter is applied to the reconstruction."""
     prepared(comm, tmp_path / "flow", removals=["kernel", "model", "training", "simulation"], overrides=[
         "tracers.particles_per_side=14", "flow.cells=16", "tracers.field_cells=16", "tracers.filtered=false",
@@ -182,12 +206,14 @@ def test_short_tracks_of_the_whole_flow_have_filtered_fields(comm, tmp_path):
                 "position/time", "position/value", "velocity/value"))
         frame, particle = (part.ravel() for part in np.meshgrid(*map(np.arange, position.shape[:2]), indexing="ij"))
         there = (frame < len(times) - 1) ^ (particle % 2 == 0)
-        write_tracks(tmp_path / "short.h5", times[frame[there]], particle[there], position[frame, particle][there],
-                     velocity[frame, particle][there])
-    scene = tracks.with_tracks(scene_of(comm, tmp_path, '[tracks]\npath = "short.h5"\nfield_every = 2\n'
-                                        'filter_width = 1.2\n'), comm)
-    tracks.run(scene, comm, tmp_path)
-    with h5py.File(tmp_path / "ground_truth.h5") as own, h5py.File(tmp_path / "flow/ground_truth.h5") as true:
+        write_tracks(tmp_path / "short.h5", times[frame[there]], particle[there].astype(np.int32),
+                     position[frame, particle][there], velocity[frame, particle][there])
+    run(scene_of(comm, tmp_path, '[tracks]\npath = "short.h5"\nfield_every = 2\nfilter_width = 1.2\n'
+                                 '[reconstruction]\nevery = 2\nfields = ["velocity"]\n'), output=tmp_path / "run",
+        comm=comm)
+    with h5py.File(tmp_path / "run/reconstruction.h5") as own:
+        assert 0 < np.mean(own["errors_over_time/validation_error"]) < 0.3
+    with h5py.File(tmp_path / "run/ground_truth.h5") as own, h5py.File(tmp_path / "flow/ground_truth.h5") as true:
         assert "particles" not in own and own["tracks"].attrs["complete"] == 0
         field, truth = own["fields/filtered/velocity"][0], true["fields/filtered/velocity"][0]
         assert own["reference"].attrs["energy"] == pytest.approx(true["reference"].attrs["energy"], rel=0.15)

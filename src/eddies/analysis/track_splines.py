@@ -2,7 +2,7 @@
 
 A track is a cubic spline with a knot at each of its times that minimises
 
-    sum_i |x_i - s(t_i)|^2 + mu h^5 int |s'''|^2 dt,    h the mean interval,
+    sum_i |x_i - s(t_i)|^2 + mu h^5 int |s'''|^2 dt,    h the median interval of all tracks,
 
 the estimate for noise of equal variance and a jerk that is white noise (TrackFit; Gesemann, Huhn, Schanz and Schröder
 2016). It damps frequencies above mu^(-1/6) / h. The ends need no condition.
@@ -18,6 +18,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 from scipy.optimize import brentq
+from scipy.sparse import csr_array, dia_array
 
 DEGREE, LEAST_ROWS = 3, 3   # fewer rows do not determine a parabola, which has no jerk
 NO_NOISE, MOST = 1e-6, 1e6  # smallest and largest mu: below the smallest no frequency that frames resolve is damped
@@ -42,14 +43,14 @@ class SmoothedTracks:
     smoothing: float
 
 
-def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: float,
+def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: float | None,
            noise: float = 0.0) -> SmoothedTracks:
-    """Fit splines to tracks in a periodic cube.
+    """Fit splines to tracks.
 
     Parameters
     ----------
     time, track : (rows,), in any order. position : (rows, 3), wrapped or not.
-    edge : of the cube. Particles move by less than half of it between two rows of a track.
+    edge : of a periodic cube; None: there is none. Particles move by less than half of it between two rows of a track.
     noise : standard deviation of a coordinate. The splines differ from the positions by as much, less the degrees of
         freedom of the splines.
     """
@@ -64,16 +65,17 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
     if not groups:
         nothing = np.zeros((0, 3))
         return SmoothedTracks(np.zeros(0, int), nothing, nothing, nothing, NO_NOISE)
-    fits = [Fit(time[rows[0]], _unwrapped(position[rows], edge)) for rows in groups]
+    interval = float(np.median(np.concatenate([np.diff(time[rows[0]]) for rows in groups])))
+    fits = [Fit(time[rows[0]], _unwrapped(position[rows], edge), interval) for rows in groups]
     smoothing = _smoothing_of(fits, noise) if noise > 0 else NO_NOISE
     values = [np.concatenate(parts) for parts in zip(*(fit.derivatives(smoothing) for fit in fits))]
     return SmoothedTracks(np.concatenate([rows.ravel() for rows in groups]), *values, smoothing)
 
 
 class Fit:
-    """The splines of tracks with the same times (n,); positions (tracks, n, 3)."""
+    """The splines of tracks with the same times (n,); positions (tracks, n, 3); h of the penalty."""
 
-    def __init__(self, times: np.ndarray, positions: np.ndarray) -> None:
+    def __init__(self, times: np.ndarray, positions: np.ndarray, interval: float) -> None:
         self.times, self.tracks = times, len(positions)
         self._values = np.moveaxis(positions, 1, 0).reshape(len(times), -1)
         before, after = times[0] - times[1], times[-1] - times[-2]
@@ -81,16 +83,15 @@ class Fit:
         self._knots = np.concatenate([times[0] + before * steps[::-1], times, times[-1] + after * steps])
         self._basis = BSpline.design_matrix(times, self._knots, DEGREE)
         unit = BSpline(self._knots, np.eye(len(times) + DEGREE - 1), DEGREE)
-        interval = np.diff(times)
-        jerk = unit.derivative(DEGREE)((times[1:] + times[:-1]) / 2)
-        self._penalty = np.mean(interval) ** 5 * (jerk.T * interval) @ jerk
+        jerk = csr_array(unit.derivative(DEGREE)((times[1:] + times[:-1]) / 2))
+        self._penalty = interval**5 * jerk.T @ dia_array((np.diff(times)[None], [0]), shape=[len(times) - 1] * 2) @ jerk
 
     def spline(self, smoothing: float, values: np.ndarray | None = None) -> BSpline:
         """The splines for mu = `smoothing`, of the positions or of other values (n, columns)."""
-        matrix = (self._basis.T @ self._basis).toarray() + smoothing * self._penalty
-        bands = np.zeros((DEGREE + 1, len(matrix)))
+        matrix = self._basis.T @ self._basis + smoothing * self._penalty
+        bands = np.zeros((DEGREE + 1, matrix.shape[0]))
         for offset in range(DEGREE + 1):
-            bands[offset, :len(matrix) - offset] = np.diagonal(matrix, -offset)
+            bands[offset, :matrix.shape[0] - offset] = matrix.diagonal(-offset)
         right = self._basis.T @ (self._values if values is None else values)
         return BSpline(self._knots, solveh_banded(bands, right, lower=True), DEGREE)
 
@@ -127,7 +128,9 @@ def _smoothing_of(fits: list[Fit], noise: float) -> float:
     return MOST if excess(high) <= 0 else float(10 ** brentq(excess, low, high, xtol=0.01))
 
 
-def _unwrapped(positions: np.ndarray, edge: float) -> np.ndarray:
-    """Continuous positions (tracks, n, 3) from wrapped ones."""
+def _unwrapped(positions: np.ndarray, edge: float | None) -> np.ndarray:
+    """Continuous positions (tracks, n, 3) from those in a periodic cube; None: in no such cube."""
+    if edge is None:
+        return positions
     moved = np.diff(positions, axis=1)
     return positions - edge * np.cumsum(np.rint(np.pad(moved, ((0, 0), (1, 0), (0, 0))) / edge), axis=1)

@@ -1,4 +1,4 @@
-"""Particle tracks of experiments and other programs: read five layouts, write one.
+"""Particle tracks of experiments and other programs: read four layouts, write one.
 
 A track is the path of one particle. Tracks are kept as rows, one for each particle and time, sorted by time. Layouts:
 
@@ -14,11 +14,13 @@ from __future__ import annotations
 
 import json
 import math
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import h5py
 import numpy as np
@@ -26,10 +28,11 @@ import numpy as np
 from eddies.io.errors import ProductError, file_errors
 from eddies.io.hdf5 import write_attributes
 from eddies.io.new_files import create_export
-from eddies.io.trajectories import write_h5md_header
+from eddies.io.trajectories import ROUNDING, write_h5md_header
 
 AXES = ("x", "y", "z")
 FILL = -1  # the id of a row without a particle
+MOST_ID = 2**53  # larger ids are not exact in double precision
 MOST_OFF = 2.0  # factor between displacements and velocities times intervals that no flow explains
 
 
@@ -71,16 +74,17 @@ class Tracks:
         """First row of each frame, and the number of rows, (frames + 1,)."""
         return np.append(np.searchsorted(self.time, self.times), len(self.time))
 
-    def displacements(self, edge: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def displacements(self, edge: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pairs of successive rows of a track: first rows (m,), displacements (m, 3) and intervals (m,).
 
-        Displacements are those to the nearest image in a periodic cube with this edge.
+        Displacements are those to the nearest image in a periodic cube with this edge; None: there are no images.
         """
         order = np.lexsort((self.time, self.track))
         same = self.track[order[1:]] == self.track[order[:-1]]
         first, second = order[:-1][same], order[1:][same]
         moved = self.position[second] - self.position[first]
-        return first, moved - edge * np.rint(moved / edge), self.time[second] - self.time[first]
+        images = 0.0 if edge is None else edge * np.rint(moved / edge)
+        return first, moved - images, self.time[second] - self.time[first]
 
 
 def read_tracks(path: str | Path, layout: str | None = None, group: str | None = None,
@@ -107,10 +111,10 @@ def read_tracks(path: str | Path, layout: str | None = None, group: str | None =
     try:
         with file_errors(path):
             found = LAYOUTS[layout](path, group, interval)
-    except (KeyError, ValueError, json.JSONDecodeError) as error:
+    except UNREADABLE as error:
         text = " ".join(str(error.args[0] if error.args else error).split())
         raise ProductError(f"{path}: cannot be read as {layout}: {text}") from None
-    return _checked(found, path)
+    return checked(found, path)
 
 
 def write_tracks(path: str | Path, times: Any, ids: Any, positions: Any, velocities: Any = None,
@@ -130,14 +134,12 @@ def write_tracks(path: str | Path, times: Any, ids: Any, positions: Any, velocit
     path = Path(path)
     columns = {"time": np.asarray(times, float), "track": np.asarray(ids), "position": np.asarray(positions, float),
                "velocity": None if velocities is None else np.asarray(velocities, float)}
-    tracks = _checked(Tracks(**columns, edge=float(edge)), path)
-    if tracks.track.dtype.kind not in "iu" or tracks.track.min() < 0:
-        raise ProductError(f"{path}: ids must be whole numbers, 0 or larger")
+    tracks = checked(Tracks(**columns, edge=float(edge)), path)
     rows = tracks.starts[1:] - tracks.starts[:-1]
     frames, most = len(rows), int(rows.max())
     frame = np.repeat(np.arange(frames), rows)
     column = np.arange(len(frame)) - np.repeat(tracks.starts[:-1], rows)
-    values = {"id": tracks.track.astype(np.int64), "position": tracks.position, "velocity": tracks.velocity}
+    values = {"id": tracks.track, "position": tracks.position, "velocity": tracks.velocity}
     layout = {f"particles/tracks/{name}/value": ((frames, most, *given.shape[1:]), given.dtype)
               for name, given in values.items() if given is not None}
     with create_export(path, layout, {}) as file:
@@ -184,7 +186,7 @@ def _read_h5md(path: Path, group: str | None, interval: float | None) -> Tracks:
             ids = holder["id"][()]
         elif "id/value" in holder:
             ids = holder["id/value"][()]
-        box = holder["box"]
+        box = holder.get("box", {})
         edges = box["edges/value"][0] if "edges/value" in box else box["edges"][()] if "edges" in box else []
         edges = np.unique(np.diag(edges) if np.ndim(edges) == 2 else edges)
     return _from_frames(times, np.broadcast_to(ids, (frames, count)), position, velocity, density,
@@ -230,15 +232,15 @@ def _read_csv(path: Path, group: str | None, interval: float | None) -> Tracks:
             raise ValueError(f"the first line must name the columns {', '.join(needed)}, but it names "
                              f"{', '.join(names)}; add or correct {name}")
     wanted = [*needed, *(["u", "v", "w"] if {"u", "v", "w"} <= {*names} else [])]
-    table = np.loadtxt(path, delimiter=delimiter, skiprows=1, usecols=[names.index(name) for name in wanted], ndmin=2)
-    track = table[:, 0].astype(np.int64)
-    if not np.array_equal(track, table[:, 0]):
-        raise ValueError("the column track must hold whole numbers")
-    return Tracks(table[:, 1], track, table[:, 2:5], table[:, 5:] if len(wanted) > 5 else None)
+    table = np.loadtxt(path, delimiter=delimiter, skiprows=1, usecols=[names.index(name) for name in wanted], ndmin=2,
+                       quotechar='"')
+    return Tracks(table[:, 1], table[:, 0], table[:, 2:5], table[:, 5:] if len(wanted) > 5 else None)
 
 
 LAYOUTS: Mapping[str, Callable[[Path, str | None, float | None], Tracks]] = {
     "h5md": _read_h5md, "npz": _read_npz, "lagrangebench": _read_lagrangebench, "csv": _read_csv}
+# What numpy, h5py and json raise of a file with other content.
+UNREADABLE = (KeyError, ValueError, TypeError, IndexError, AttributeError, EOFError, BadZipFile, zlib.error)
 
 
 def _opened(path: Path) -> h5py.File:
@@ -281,8 +283,8 @@ def _from_frames(times: np.ndarray, ids: np.ndarray, position: np.ndarray, veloc
 # ---- checks
 
 
-def _checked(tracks: Tracks, path: Path) -> Tracks:
-    """The tracks sorted by time and id. Raises ProductError for rows that are none."""
+def checked(tracks: Tracks, path: Path) -> Tracks:
+    """The tracks sorted by time and id, with ids of 64 bits. Raises ProductError for rows that are none."""
     rows = len(tracks.time)
     if not rows:
         raise ProductError(f"{path}: holds no particles")
@@ -294,6 +296,11 @@ def _checked(tracks: Tracks, path: Path) -> Tracks:
         if len(bad):
             raise ProductError(f"{path}: {name} of track {tracks.track[bad[0]]} at time {tracks.time[bad[0]]:g} is not "
                                f"finite ({len(bad)} such rows); leave these rows out")
+    bad = np.flatnonzero((tracks.track != np.rint(tracks.track)) | (tracks.track < 0) | (tracks.track >= MOST_ID))
+    if len(bad):
+        raise ProductError(f"{path}: track {tracks.track[bad[0]]} at time {tracks.time[bad[0]]:g}: ids must be whole "
+                           f"numbers from 0 to 2^53 ({len(bad)} such rows); number the tracks so")
+    tracks = replace(tracks, track=tracks.track.astype(np.int64))
     sorted_tracks = tracks.chosen(np.lexsort((tracks.track, tracks.time)))
     time, track = sorted_tracks.time, sorted_tracks.track
     twice = np.flatnonzero((np.diff(time) == 0) & (np.diff(track) == 0))
@@ -303,17 +310,21 @@ def _checked(tracks: Tracks, path: Path) -> Tracks:
     return sorted_tracks
 
 
-def check_box(tracks: Tracks, edge: float, path: str | Path) -> None:
-    """Raise ProductError for positions outside the cube, or velocities that contradict displacements.
-
-    Both mean that lengths or times have another unit than the file is said to have.
-    """
-    outside = np.flatnonzero(((tracks.position < 0) | (tracks.position > edge)).any(1))
+def check_inside(tracks: Tracks, lower: np.ndarray, upper: np.ndarray, key: str, path: str | Path) -> None:
+    """Raise ProductError for positions outside the box or volume that a key gives: the unit of length is another."""
+    margin = ROUNDING * (upper - lower)
+    outside = np.flatnonzero(((tracks.position < lower - margin) | (tracks.position > upper + margin)).any(1))
     if len(outside):
-        row = outside[0]
-        raise ProductError(f"{path}: track {tracks.track[row]} at time {tracks.time[row]:g} is at "
-                           f"({', '.join(f'{x:.4g}' for x in tracks.position[row])}), outside the box from 0 to "
-                           f"{edge:g} ({len(outside)} such rows); correct the box or the unit of length")
+        row, (place, low, high) = outside[0], (", ".join(f"{x:.4g}" for x in point) for point in (
+            tracks.position[outside[0]], lower, upper))
+        raise ProductError(f"{path}: track {tracks.track[row]} at time {tracks.time[row]:g} is at ({place}), outside "
+                           f"the {key} from ({low}) to ({high}) ({len(outside)} such rows); correct {key} or the unit "
+                           "of length")
+
+
+def check_velocities(tracks: Tracks, edge: float | None, path: str | Path) -> None:
+    """Raise ProductError for velocities that contradict displacements, in a periodic cube with this edge or in none:
+    lengths or times have another unit than the file is said to have."""
     if tracks.velocity is None:
         return
     first, moved, interval = tracks.displacements(edge)

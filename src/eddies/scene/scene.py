@@ -86,8 +86,14 @@ class Scene(Section):
 
     @property
     def ground_truth_alone(self) -> "Scene":
-        """The scene without kernel, model and rollout."""
-        return replace(self.without_variants, kernel=None, model=None, training=None, simulation=None, eulerian=None)
+        """The scene without kernel, reconstruction, model and rollout."""
+        return replace(self.without_variants, kernel=None, reconstruction=None, model=None, training=None,
+                       simulation=None, eulerian=None)
+
+    @property
+    def of_tracks(self) -> bool:
+        """Whether the scene or a variant has measured tracks."""
+        return any(each.tracks is not None for each in (self, *self.variant.values()))
 
     @property
     def sets(self) -> Mapping[str, Tracers]:

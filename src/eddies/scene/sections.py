@@ -120,11 +120,12 @@ class Tracks(Section):
     """Measured particle tracks, in the place of the direct simulation and its tracers.
 
     Lengths have the unit of the file, and velocities that length over the unit of `time_unit`. In the run the edge of
-    the box is 2 pi, and the unit of time stays. The tracks must be there in all frames; others are left out.
+    the box is 2 pi, and the unit of time stays. Fields are made from all tracks of a frame; models take those that are
+    there in all frames.
     """
 
     path: str = text("file with the tracks")
-    format: str | None = choice("layout of the file (docs/data.md); absent: by its name and content", "h5md", "npz",
+    format: str | None = choice("layout of the file (docs/tracks.md); absent: by its name and content", "h5md", "npz",
                                 "lagrangebench", "csv", default=None)
     group: str | None = text("name of the particles or of the trajectory in a file with several", default=None)
     box: float | None = number("edge of the periodic cube; absent: that of the file", default=None, above=0)
@@ -147,6 +148,9 @@ class Tracks(Section):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.volume is None:
+            if self.margin is not None:
+                raise self.problem("margin", "this key belongs to volume, which is missing; remove it, or give volume "
+                                   "in place of box")
             return
         if len(self.volume) != 6 or not all(low < high for low, high in zip(self.volume[::2], self.volume[1::2])):
             raise self.problem("volume", "must be six numbers x0, x1, y0, y1, z0, z1, of which each second is larger")
@@ -289,7 +293,7 @@ class Tracers(Section):
     @property
     def _per_side(self) -> float:
         """Cube root of the number of particles."""
-        return self.particles_per_side or math.cbrt(self.particles)
+        return self.particles_per_side or round(math.cbrt(self.particles), 9)
 
     def radius_of(self, neighbors: float) -> float:
         """Radius h of the ball that holds so many of the N particles on average: n = N (4/3) pi h^3 / L^3."""
@@ -380,6 +384,11 @@ class Reconstruction(Section):
     holdout: float = number("share of the tracks that a second reconstruction leaves out, to estimate the error; 0: "
                             "none", default=0.1, at_least=0, at_most=0.5)
     memory: float = number("time for which a wave is remembered, over 1 / (k u')", default=64.0, above=0)
+
+    @property
+    def of_neighbors(self) -> bool:
+        """Whether the method estimates each grid point from the particles around it."""
+        return self.method not in ("least-squares", "memory")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,7 +28,7 @@ def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
 
     Raises SceneError at the end if a run would be refused.
     """
-    if scene.tracks is not None:
+    if scene.of_tracks:
         from eddies.workflows.tracks import with_tracks  # imports torch
         scene = with_tracks(scene, comm)
     found, subject = numbers(scene, comm), ""

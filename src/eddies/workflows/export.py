@@ -91,11 +91,11 @@ def _write(output: Path, case: str, group: str, series: Any, provenance: Provena
     if data_set and group == "fields":
         log.info("export: %s is left out: a data set holds particles only", case)
         return False
-    if data_set and (problem := shortcoming(series)):
-        log.warning("export: %s is left out: %s", case, problem)
-        return False
     if group == "particles" and "position" not in series.columns:
         log.info("export: %s is left out: its rows belong to other tracks in each frame", case)
+        return False
+    if data_set and (problem := shortcoming(series)):
+        log.warning("export: %s is left out: %s", case, problem)
         return False
     path = output / (case if data_set else f"{case}.vtkhdf")
     if data_set:

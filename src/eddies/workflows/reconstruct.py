@@ -275,7 +275,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                     "highest_wavenumber": grid.resolved})
     guard.checkpoints.remove()
     log.info("reconstruct: %s; means over time: %s", settings.method, ", ".join(
-        f"{key.replace('_', ' ')} {np.mean([row[key] for row in table]):.3g}"
+        f"{key.replace('_', ' ')} {np.nanmean([row[key] for row in table]):.3g}"
         for table in tables.values() if table for key in table[0] if key != "time"))
 
 

@@ -62,7 +62,7 @@ class StepTimes(StopRequest):
 def run(scene: Scene, comm: Comm, signals: Sequence[int] = ()) -> None:
     """Log seconds a step and wall time of each stage, of all variants, on one ground truth; all ranks call it. Raises
     Stopped after a signal."""
-    if scene.tracks is not None:
+    if scene.of_tracks:
         raise SceneError(f"{scene.name}: `eddies check --time` shortens direct simulations, and this scene has "
                          "[tracks]; run it, and read the times in the report")
     stop = StepTimes(comm, signals)

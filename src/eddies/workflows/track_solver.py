@@ -14,7 +14,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.resolved_velocity import ResolvedVelocity
+from eddies.particles.resolved_velocity import WEIGHT, ResolvedVelocity
 
 WEIGHTS = 10.0 ** np.arange(3, -1.1, -0.5)  # of the noise of least squares, of which cross-validation chooses one
 RISE = 1.02             # of the error of validation, at which the search ends
@@ -29,9 +29,13 @@ def best_solver(particles: ParticleSet, make: Callable[[float], ResolvedVelocity
 
     `make` makes a solver of a weight. Returns it with its weight, and its error relative to the rms velocity. The
     weight depends on the filter, on the errors of measured velocities and on the number of particles, none of which is
-    known well. Weights are tried from the largest on, until the error rises by a fiftieth. Collective.
+    known well. Weights are tried from the largest on, until the error rises by a fiftieth. Where so few particles are
+    there that none is left out, the weight is the default, and the error NaN. Collective.
     """
     known, apart = split(particles, share)
+    default = make(WEIGHT)
+    if not global_sum(default.grid.decomposition.comm, len(apart.id)):
+        return default, WEIGHT, math.nan
     errors: dict[float, float] = {}
     for weight in WEIGHTS.tolist():
         solver = make(weight)

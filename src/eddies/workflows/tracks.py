@@ -27,7 +27,7 @@ from eddies.particles.particle_set import as_numpy
 from eddies.particles.resolved_velocity import ResolvedFlow
 from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Flow, Scene, SceneError, Tracers
-from eddies.scene.sections import Eulerian, Tracks
+from eddies.scene.sections import Eulerian, Initial, Tracks
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.workflows.ground_truth.track_frames import TrackFrames, measured
 from eddies.workflows.run_directory.fingerprints import stage_provenance
@@ -46,12 +46,12 @@ def with_tracks(scene: Scene, comm: Comm) -> Scene:
     Raises SceneError or ProductError if the tracks do not fit, or the scene has other such sections.
     """
     settings = scene.tracks
-    for each in (scene, *scene.variant.values()):
+    for name, each in {"": scene, **scene.variant}.items():
+        if each.tracks != settings:
+            raise SceneError(f'variant "{name}": all variants have the same tracks; change [tracks] for the whole '
+                             "scene")
         for problem in _unfit(each):
             raise SceneError(problem)
-        if each.tracks != settings:
-            raise SceneError(f'variant "{each.name}": all variants have the same tracks; change [tracks] for the whole '
-                             "scene")
     learned = any(part is not None for part in (scene.kernel, scene.model, scene.simulation))
     found = in_files(comm, settings.file, lambda: _sections_of(settings, learned))
     for name, own in found.items():
@@ -63,9 +63,19 @@ def with_tracks(scene: Scene, comm: Comm) -> Scene:
 def _unfit(scene: Scene) -> Iterator[str]:
     """Sections and terms of a scene that tracks cannot serve."""
     settings, model, simulation = scene.tracks, scene.model, scene.simulation
-    for name in ("forcing", "spin_up"):
-        if getattr(scene, name) is not None:
+    for name, default in (("initial", Initial()), ("forcing", None), ("spin_up", None)):
+        if getattr(scene, name) != default:
             yield f"[{name}]: [tracks] takes the place of this section; remove it"
+    if scene.realisations is not None:
+        yield (f"realisations = {[*scene.realisations]}: the file has one realisation; remove the key, and give each "
+               "file a scene of its own")
+    if (wanted := scene.reconstruction) is not None:
+        if settings.viscosity is None and (wanted.method == "memory" or "acceleration" in wanted.fields):
+            yield ("[tracks] viscosity: this key is missing, and the method memory and the acceleration need it; give "
+                   "it, or change [reconstruction]")
+        if settings.volume is not None and wanted.of_neighbors:
+            yield (f'[reconstruction] method = "{wanted.method}": its points need particles on all sides, which a '
+                   'volume that is not periodic lacks; set method = "least-squares" or "memory"')
     learned = [f"[{name}]" for name in ("kernel", "model", "simulation") if getattr(scene, name) is not None]
     if learned and not settings.filtered:
         yield (f"[tracks] filtered = false: models are those of a filtered velocity; remove {', '.join(learned)}, or "

@@ -94,7 +94,9 @@ def estimate(scene: Scene) -> Estimates:
     """Estimate the turbulence, the speeds and the steps of a scene."""
     initial, time, tracers, settings = scene.initial, scene.time, scene.tracers, scene.simulation
     turbulence = None if scene.tracks else expected_turbulence(scene.flow, initial, scene.forcing)
-    peak, rms = peak_speed(scene.flow, initial, turbulence), rms_speed(initial, turbulence)
+    peak = rms = None
+    if scene.tracks is None:
+        peak, rms = peak_speed(scene.flow, initial, turbulence), rms_speed(initial, turbulence)
     bound = courant_step(scene.flow, time, peak)
     step, limited_by = flow_step(time, bound)
     spin_up, followed = (0.0 if part is None else part.turnovers * turbulence.turnover_time if turbulence else None

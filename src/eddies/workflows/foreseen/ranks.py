@@ -8,6 +8,7 @@ from eddies.io.provenance import product_attributes
 from eddies.scene.integrators import MOST_COURANT
 from eddies.scene.rules import quoted
 from eddies.scene.scene import BOX_LENGTH, Horizons, Scene, Tracers
+from eddies.scene.sections import NEIGHBORS
 from eddies.workflows.foreseen.numbers import expected_turbulence
 
 PEAK_VELOCITY = 4.0          # largest component of the velocity of a particle over u'
@@ -46,6 +47,8 @@ def most_ranks(scene: Scene) -> dict[str, int]:
                 limits[f"[training] truths: {quoted(name)}: {reason}"] = found[reason]
     if scene.reconstruction:
         limits[RESOLVED] = resolved_grid_ranks(tracers, 0.0)
+        if scene.reconstruction.of_neighbors:
+            limits |= reach_limit(tracers, scene.kernel_support or tracers.radius_of(NEIGHBORS))
     if scene.coarse_cells:
         # In one step particles move through as many cells as the Courant number.
         farther = math.ceil(max(scene.time.courant, MOST_COURANT * simulation.finds_step)) - 1

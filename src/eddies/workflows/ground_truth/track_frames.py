@@ -11,13 +11,14 @@ import numpy as np
 
 from eddies.analysis.track_splines import smooth
 from eddies.io.hdf5 import in_files
-from eddies.io.track_files import Tracks, check_box, read_tracks
+from eddies.io.track_files import Tracks, check_inside, check_velocities, checked, read_tracks
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import block_starts
 from eddies.scene.scene import BOX_LENGTH, SceneError
 from eddies.scene.sections import Tracks as Settings
 
-UNEQUAL = 1e-3    # largest relative difference of two intervals between frames
+UNEQUAL = 0.01    # largest distance of a time from equal intervals, over the interval
+SAME = 1e-3       # part of the longest interval below which two times are the same frame
 LEAST_FRAMES = 3
 MARGIN = 4.0      # spacings between a volume and its periodic image
 
@@ -118,19 +119,15 @@ def _measured(settings: Settings, state: tuple[int, int] | None) -> MeasuredTrac
     if settings.sound_speed is not None and found.density is None:
         raise SceneError(f"[tracks] sound_speed = {settings.sound_speed:g}: {settings.file} has no densities; remove "
                          "the key")
-    found = replace(found, time=found.time * settings.time_unit)
-    if settings.volume is None:
-        check_box(found, edge, settings.file)
-    times, intervals = found.times, np.diff(found.times)
-    if len(times) < LEAST_FRAMES:
-        raise SceneError(f"{settings.file}: has {len(times)} frames; at least {LEAST_FRAMES} are needed")
-    if np.ptp(intervals) > UNEQUAL * intervals.mean():
-        raise SceneError(f"{settings.file}: frames follow each other at intervals of {intervals.min():g} to "
-                         f"{intervals.max():g}; equal ones are needed")
+    period = edge if settings.volume is None else None
+    found = _at_frames(found, settings)
+    if settings.noise == 0:
+        check_velocities(found, period, settings.file)
+    times = found.times
     about: dict[str, Any] = {"file": settings.path, "in_file": len(np.unique(found.track))}
     position, velocity = found.position, found.velocity
     if velocity is None or settings.noise > 0:
-        splines = smooth(found.time, found.track, position, edge, settings.noise)
+        splines = smooth(found.time, found.track, position, period, settings.noise)
         order = np.argsort(splines.rows)
         position, velocity = splines.position[order], splines.velocity[order]
         found = found.chosen(splines.rows[order])
@@ -144,8 +141,32 @@ def _measured(settings: Settings, state: tuple[int, int] | None) -> MeasuredTrac
     if settings.sound_speed is not None:
         columns["density"] = found.density / found.density.mean()
     spacing = (volume / (len(found.time) / len(times))) ** (1 / 3) / unit
-    return MeasuredTracks(times - times[0], found.starts, columns, (counts == len(times))[place], spacing, unit, corner,
+    return MeasuredTracks(times, found.starts, columns, (counts == len(times))[place], spacing, unit, corner,
                           about | {"length_unit": unit, "corner": corner})
+
+
+def _at_frames(found: Tracks, settings: Settings) -> Tracks:
+    """The tracks at times 0, h, 2 h, ... in the unit of velocities, with six digits of h.
+
+    Raises SceneError for too few frames, unequal intervals or a frame without tracks.
+    """
+    path, gaps = settings.file, np.diff(found.times)
+    gaps = gaps[gaps > SAME * gaps.max(initial=0.0)]
+    if len(gaps) + 1 < LEAST_FRAMES:
+        raise SceneError(f"{path}: has {len(gaps) + 1} frames; at least {LEAST_FRAMES} are needed")
+    last = round((found.time[-1] - found.time[0]) / float(np.median(gaps)))
+    interval = (found.time[-1] - found.time[0]) / last
+    frame = np.rint((found.time - found.time[0]) / interval)
+    off = np.abs(found.time - found.time[0] - frame * interval)
+    if off.max() > UNEQUAL * interval:
+        raise SceneError(f"{path}: frames at equal intervals are needed, and with one of {interval:g} the frame at "
+                         f"time {found.time[np.argmax(off)]:g} is beside its place; interpolate the tracks to such "
+                         "times")
+    missing = np.setdiff1d(np.arange(last), frame)
+    if len(missing):
+        raise SceneError(f"{path}: no track is there at time {found.time[0] + missing[0] * interval:g} ({len(missing)} "
+                         "such frames); give a part of the file without such a gap")
+    return checked(replace(found, time=frame * float(f"{interval * settings.time_unit:.6g}")), path)
 
 
 def _placed(found: Tracks, settings: Settings) -> tuple[Tracks, float, float, np.ndarray]:
@@ -158,13 +179,10 @@ def _placed(found: Tracks, settings: Settings) -> tuple[Tracks, float, float, np
         if edge is None:
             raise SceneError("[tracks] box: this key is missing, and the file has no cubic box; give the edge of the "
                              "periodic cube, or the volume of the measurement")
+        check_inside(found, np.zeros(3), np.full(3, edge), "box", settings.file)
         return found, edge, edge**3, np.zeros(3)
     lower, upper = np.reshape(settings.volume, (3, 2)).T
-    outside = ((found.position < lower) | (found.position > upper)).any(1)
-    if outside.any():
-        row = int(np.argmax(outside))
-        raise SceneError(f"[tracks] volume: track {found.track[row]} of {settings.file} is outside at time "
-                         f"{found.time[row]:g} ({outside.sum()} such rows); correct the volume or the unit of length")
+    check_inside(found, lower, upper, "volume", settings.file)
     whole = float(np.prod(upper - lower))
     spacing = (whole / (len(found.time) / len(found.times))) ** (1 / 3)
     edge = float((upper - lower).max()) + (MARGIN * spacing if settings.margin is None else settings.margin)
