@@ -383,7 +383,7 @@ class Reconstruction(Section):
     particles: bool = boolean("whether the quantities are stored at the particles too", default=False)
     holdout: float = number("share of the tracks that a second reconstruction leaves out, to estimate the error; 0: "
                             "none", default=0.1, at_least=0, at_most=0.5)
-    memory: float = number("time for which a wave is remembered, over 1 / (k u')", default=64.0, above=0)
+    memory: float = number("time for which a wave is remembered, over 1 / (k u')", default=4.0, above=0)
 
     @property
     def of_neighbors(self) -> bool:
