@@ -4,8 +4,8 @@
     mpirun -n 2 .venv/bin/python tests/validation/twin_tracks.py runs/tracks [runs/tracks-2 ...]
 
 Writes the tracks of each case as a user would have them, reconstructs them, and compares the fields, after the filter
-of the stored ones, with these. Prints means and standard deviations over the runs, at all times after the first t_eta,
-and writes docs/results/tracks.json.
+of the stored ones, with these. Prints means over the runs, at all times after the first t_eta, and the standard
+deviations of several runs, and writes docs/results/tracks.json.
 """
 
 import json
@@ -140,11 +140,10 @@ def main(runs: list[Path]) -> None:
                     for name, values in errors_of(case, path / "run", truth).items():
                         found[name].append(values.mean())
         if comm.rank == 0:
-            row = {**case.__dict__, **{name: (np.mean(values), np.std(values, ddof=min(1, len(values) - 1)))
-                                       for name, values in found.items()}}
-            rows.append(row)
-            print(case, {name: f"{mean:.4f} ± {spread:.4f}" for name, (mean, spread) in
-                         ((name, row[name]) for name in found)}, flush=True)
+            means = {name: float(np.mean(values)) for name, values in found.items()}
+            spreads = {f"{name}_spread": float(np.std(values, ddof=1)) for name, values in found.items() if len(runs) > 1}
+            rows.append({**case.__dict__, **means, **spreads})
+            print(rows[-1], flush=True)
     if comm.rank == 0:
         HERE.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 
