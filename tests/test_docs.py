@@ -52,6 +52,7 @@ def marked(name):
     return TEXT.split(f"<!-- {name} -->")[1].split(f"<!-- end of {name} -->")[0].strip()
 
 
+OF_THE_MACHINE = "of memory here|are free here"  # a warning of a small machine, not of a command
 COMMANDS = [line.strip() for block in blocks("bash") for line in block.replace("\\\n", " ").splitlines()
             if line.strip() and not line.strip().startswith("#")]
 EXAMPLE_NAME, EXAMPLE = next(match.groups() for block in blocks("toml")
@@ -107,7 +108,7 @@ def test_command_exists(command, folder):
 def test_cheap_command_runs(comm, command, folder, capfd):
     assert main(shlex.split(command)[1:]) == 0
     output = capfd.readouterr().out
-    warnings = [line for line in output.splitlines() if "warning" in line and "of memory here" not in line]
+    warnings = [line for line in output.splitlines() if "warning" in line and not re.search(OF_THE_MACHINE, line)]
     assert output and warnings == []
 
 

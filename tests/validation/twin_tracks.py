@@ -141,7 +141,8 @@ def main(runs: list[Path]) -> None:
                         found[name].append(values.mean())
         if comm.rank == 0:
             means = {name: float(np.mean(values)) for name, values in found.items()}
-            spreads = {f"{name}_spread": float(np.std(values, ddof=1)) for name, values in found.items() if len(runs) > 1}
+            spreads = {f"{name}_spread": float(np.std(values, ddof=1)) for name, values in found.items()
+                       if len(runs) > 1}
             rows.append({**case.__dict__, **means, **spreads})
             print(rows[-1], flush=True)
     if comm.rank == 0:
