@@ -54,6 +54,7 @@ class Method(Protocol):
 
     def state_dict(self) -> dict[str, Any]:
         """What the next frame needs of those before: tensors of modes, and plain values."""
+        return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore that."""
@@ -78,7 +79,7 @@ class LeastSquaresMethod:
         self._near = state["modes"]
 
 
-class NeighbourMethod:
+class NeighbourMethod(Method):
     """A form of reconstruction from the neighbours of each grid point, on a grid of modes."""
 
     def __init__(self, form: Form, grid: FourierGrid) -> None:
@@ -91,12 +92,6 @@ class NeighbourMethod:
         velocity = self._form.of(field).velocity_on_grid().T.reshape(3, slab.count, slab.planes, slab.planes)
         mean = mean_over_ranks(slab.comm, particles.velocity).to(self._grid.dtype)
         return self._grid.to_modes(velocity.to(self._grid.dtype) - mean[:, None, None, None])
-
-    def state_dict(self) -> dict[str, Any]:
-        return {}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        pass
 
 
 class Source:
