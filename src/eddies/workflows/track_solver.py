@@ -1,4 +1,4 @@
-"""Least squares for particles of which little is known: the weight of the noise is found by cross-validation."""
+"""Least squares for measured particles. Cross-validation finds the weight of the noise."""
 
 from __future__ import annotations
 
