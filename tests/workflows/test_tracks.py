@@ -294,6 +294,15 @@ particles = true
     assert relative(field, exact) < 0.2
 
 
+@pytest.mark.mpi(1)
+def test_a_volume_has_no_images(comm, tmp_path):
+    """A particle that moves by more than half of the cube, to and fro: x = 0.1 + 0.7 (2 t - t^2) at t = 0, 1, 2."""
+    write_tracks(tmp_path / "a.h5", [0, 1, 2], [0, 0, 0], [[0.1, 0.5, 0.5], [0.8, 0.5, 0.5], [0.1, 0.5, 0.5]])
+    found = measured(scene_of(comm, tmp_path, '[tracks]\npath = "a.h5"\nvolume = [0, 1, 0, 1, 0, 1]\n'
+                                              'margin = 0.1\n').tracks)
+    assert found.frame(0)["velocity"][0, 0] * found.unit == pytest.approx(1.4, rel=1e-3)
+
+
 def at_points(field, places):
     """A field (3, z, y, x) on the cube of edge MILLIMETRES at points [z, y, x], by its Fourier series."""
     modes, cells = np.fft.fftn(field, axes=(1, 2, 3)) / field[0].size, field.shape[1]
