@@ -214,6 +214,9 @@ def test_files_that_do_not_fit(comm, tmp_path):
     path = comm.bcast(str(tmp_path))
     (line,), _ = problems_of(load_scene("taylor-green", ["initial.kind=file", f"initial.path={path}/start.h5"]), comm)
     assert f"{path}/start.h5" in line
+    start = ["initial.kind=file", f"initial.path={path}/start.h5", "realisations=[7]"]
+    lines, _ = problems_of(load_scene(TINY, start, ["initial.peak_wavenumber"]), comm)
+    assert [f"{path}/{name}start.h5" in line for name, line in zip(("", "realisation-7/"), lines, strict=True)] == [True] * 2
     if comm.rank == 0:
         (tmp_path / "model.h5").write_text("nothing")
     comm.Barrier()

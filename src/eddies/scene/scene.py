@@ -49,8 +49,9 @@ class Scene(Section):
     label: str | None = text("name of the variant in tables and figures; absent: NAME of [variant.NAME]", default=None)
     seed: int = integer("seed of every random number", default=1, at_least=0, at_most=10**18)
     realisations: tuple[int, ...] | None = integers(
-        "seeds of further ground truths, which no training sees: rollouts are made on each from its beginning; absent: "
-        "on the ground truth of the scene, after the training window", default=None, at_least=0)
+        "seeds of further ground truths, which no training sees: rollouts are made on each from its beginning; a flow "
+        "of kind file starts from the realisation of the same seed beside its file; absent: on "
+        "the ground truth of the scene, after the training window", default=None, at_least=0)
     device: str = choice("where particles are computed", "cpu", "cuda", default="cpu")
     tracks: Tracks | None = section(Tracks, default=None)
     flow: Flow = section(Flow, default=None)
@@ -83,6 +84,17 @@ class Scene(Section):
     def without_variants(self) -> "Scene":
         """The scene without variants and realisations."""
         return replace(self, variant={}, realisations=None) if self.variant or self.realisations else self
+
+    def realisation(self, seed: int) -> "Scene":
+        """The scene with another seed.
+
+        A flow that starts from a ground truth starts from the realisation of this seed in the same run directory.
+        """
+        start = self.initial
+        if start.flow.from_file and start.file is not None:
+            path = start.file.parent / f"{REALISATION}{seed}" / start.file.name
+            return replace(self, seed=seed, initial=replace(start, path=str(path)))
+        return replace(self, seed=seed)
 
     @property
     def ground_truth_alone(self) -> "Scene":

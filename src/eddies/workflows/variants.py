@@ -98,7 +98,7 @@ def rollouts(scene: Scene, directory: Path) -> dict[str, list[Place]]:
         step_from = str(where) if own.simulation.finds_step else own.simulation.step_from
         simulation = replace(own.simulation, start=0.0, step_from=step_from, confirmed_on=None)
         found[name or scene.name] = [
-            Place(replace(own, seed=seed, model=model, training=None, simulation=simulation),
+            Place(replace(own.realisation(seed), model=model, training=None, simulation=simulation),
                   where / f"{REALISATION}{seed}") for seed in scene.realisations]
     return found
 
@@ -124,7 +124,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
     # A ground truth for rollouts from its beginning; no model is needed there.
     simulation = whole.simulation and replace(whole.simulation, method="none", start=0.0, confirmed_on=None)
     truth = replace(whole, model=None, training=None, eulerian=None, simulation=simulation)
-    for own, where in [(whole, directory), *((replace(truth, seed=seed), place)
+    for own, where in [(whole, directory), *((truth.realisation(seed), place)
                                              for seed, place in zip(seeds, realisations))]:
         planned.append((None, Place(own, where), SHARED))
         for name, tracers in own.sets.items():
