@@ -1,6 +1,8 @@
 """How Sphinx makes the site of these pages: .venv/bin/sphinx-build -W docs site."""
 
 import eddies
+from docutils import nodes
+from latex2mathml.converter import convert
 
 project, author, copyright = "eddies", "the eddies developers", "the eddies developers"
 release = eddies.__version__
@@ -18,6 +20,20 @@ nb_execution_mode = "off"
 nb_execution_in_temp = nb_execution_raise_on_error = nb_merge_streams = True
 nb_execution_timeout = 600
 
+# Formulas are MathML, which browsers render without a script from elsewhere.
+html_math_renderer = "mathml"
+
 html_theme = "furo"
 html_title = "eddies"
 html_static_path = html_css_files = ["site.css"]
+
+
+def setup(app):
+    """Add the renderer of formulas."""
+    def math(display):
+        def visit(translator, node):
+            translator.body.append(convert(node.astext(), display=display))
+            raise nodes.SkipNode
+        return visit, None
+
+    app.add_html_math_renderer("mathml", math("inline"), math("block"))

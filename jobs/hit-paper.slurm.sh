@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # sbatch jobs/hit-paper.slurm.sh [options of `eddies dns`]
 # Ground truth of the scene hit-paper: 1024^3 cells on 256 ranks, 64 on each of four nodes, about 84 GB of memory per
-# node. `eddies check hit-paper` on ranks of your cluster estimates the hours. A job that meets its limit is queued again
-# and continues. The later stages use at most 22 ranks. Submit them afterwards:
+# node. `eddies check hit-paper` on ranks of your cluster estimates the hours. A job that reaches its time limit is
+# queued again and continues. The later stages use at most 22 ranks. Submit them afterwards:
 #   EDDIES_SCENE=hit-paper sbatch --ntasks-per-node=22 jobs/slurm.sh
 # Submit from the checkout, or set EDDIES_CHECKOUT to it. Load your cluster's modules first, as for set-up.
 #SBATCH --job-name=hit-paper
@@ -20,7 +20,7 @@
 ##SBATCH --partition=NAME
 EDDIES_SCENE=hit-paper
 ranks=(srun --mpi="${SLURM_MPI_TYPE:-pmix}" --export=ALL --cpus-per-task="${SLURM_CPUS_PER_TASK:-1}")
-ground_truth() { "${ranks[@]}" "$1" dns "${@:3}"; }  # this stage instead of `run`, which is all of them
+ground_truth() { "${ranks[@]}" "$1" dns "${@:3}"; }  # only this stage; `run` would run all
 launcher=(ground_truth)
 resubmit=(scontrol requeue "${SLURM_JOB_ID:-}")
 

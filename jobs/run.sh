@@ -19,6 +19,6 @@ status=0
 if [ "$status" -eq 138 ]; then status=75; fi  # SIGUSR1 came before the ranks could catch it
 if [ "$status" -eq 75 ]; then
     echo "stopped before the time limit: the same command continues"
-    "${resubmit[@]}" || echo "not queued again, do it by hand: ${resubmit[*]}" >&2
+    "${resubmit[@]}" || echo "could not queue the job again, do it by hand: ${resubmit[*]}" >&2
 fi
 exit "$status"

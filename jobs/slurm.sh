@@ -13,10 +13,10 @@
 #SBATCH --open-mode=append
 # Exports the environment of sbatch with its modules; to set a variable: --export=ALL,EDDIES_SCENE=hit
 #SBATCH --export=ALL
-# Where your cluster asks for them, with a single #:
+# If your cluster requires these, write them with a single #:
 ##SBATCH --account=NAME
 ##SBATCH --partition=NAME
-# How srun connects the ranks; `srun --mpi=list` names others for SLURM_MPI_TYPE.
+# SLURM_MPI_TYPE sets how srun connects the ranks; `srun --mpi=list` lists its values.
 launcher=(srun --mpi="${SLURM_MPI_TYPE:-pmix}" --export=ALL --cpus-per-task="${SLURM_CPUS_PER_TASK:-1}")
 resubmit=(scontrol requeue "${SLURM_JOB_ID:-}")
 

@@ -31,7 +31,7 @@ find_python() {
     done
 }
 
-mpi_flavour() {  # as Debian calls it
+mpi_flavour() {  # its name in Debian packages
     if mpicc --showme:version > /dev/null 2>&1; then echo openmpi; else echo mpich; fi
 }
 
@@ -49,9 +49,9 @@ find_hdf5() {
 
 check_settings() {
     if [ -n "${EDDIES_PYTHON:-}" ] && [ -z "$(find_python)" ]; then
-        fail "EDDIES_PYTHON=$EDDIES_PYTHON is no Python 3.11 or newer"
+        fail "EDDIES_PYTHON=$EDDIES_PYTHON is not Python 3.11 or newer"
     elif [ -n "${HDF5_DIR:-}" ] && [ -z "$(find_hdf5)" ]; then
-        fail "HDF5_DIR=$HDF5_DIR holds no include/hdf5.h"
+        fail "HDF5_DIR=$HDF5_DIR has no include/hdf5.h"
     fi
 }
 
@@ -74,7 +74,7 @@ install_packages() {
     if [ -z "$missing" ]; then return; fi
     if [ "$(id -u)" -ne 0 ]; then as_root=(sudo -n); fi
     if ! have apt-get || ! "${as_root[@]}" true 2> /dev/null; then
-        fail "missing: $missing (as Debian calls them). Install them, or load the modules of your cluster for
+        fail "missing: $missing (names of Debian packages). Install them, or load the modules of your cluster for
 MPI, parallel HDF5 (set HDF5_DIR to its folder) and Python 3.11 or newer (EDDIES_PYTHON); then run this again."
     fi
     say "installing system packages: $missing"
@@ -89,7 +89,7 @@ make_environment() {
     local python
     python=$(find_python)
     if [ -z "$python" ]; then
-        fail "Python 3.11 or newer is needed, python3 is $(python3 -V 2>&1). Install one beside it" \
+        fail "Python 3.11 or newer is needed, but python3 is $(python3 -V 2>&1). Install one beside it" \
              "(Ubuntu 22.04: apt-get install python3.11-venv python3.11-dev) or set EDDIES_PYTHON to one."
     fi
     if "$venv/bin/python" -m pip --version > /dev/null 2>&1 && grep -q "$venv/bin/python" "$venv/bin/pip"; then return; fi
@@ -147,7 +147,7 @@ make_environment
 say "installing Python packages (torch is large)"
 install setuptools wheel cython pkgconfig numpy mpi4py
 install_h5py
-rm -f src/eddies/kernels/*.so  # not overwritten: a job may have loaded them
+rm -f src/eddies/kernels/*.so  # removed, not overwritten: a running job may have loaded them
 if ! install --no-build-isolation --editable '.[test,docs]'; then
     fail "eddies could not be installed, see above; its kernels need a C++17 compiler with OpenMP: install g++"
 fi

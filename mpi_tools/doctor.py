@@ -52,8 +52,8 @@ def accelerator(torch) -> str:
 def unconnected(comm: MPI.Comm) -> list[str]:
     """Return a complaint if MPI does not connect all ranks that were started."""
     started = next((int(os.environ[name]) for name in STARTED if os.environ.get(name, "").isdecimal()), 0)
-    return [f"{started} ranks were started, MPI connects {comm.size} of them: start them with the mpirun of this MPI, "
-            "with Slurm by srun --mpi=pmix"] if started > comm.size else []
+    return [f"{started} ranks were started, but MPI connects {comm.size} of them: start them with the mpirun of this "
+            "MPI, or under Slurm with srun --mpi=pmix"] if started > comm.size else []
 
 
 def ring_bandwidth(comm: MPI.Comm) -> tuple[float, list[str]]:
@@ -127,7 +127,7 @@ def main() -> int:
 if __name__ == "__main__":
     try:
         code = main()
-    except Exception:  # on one rank: the others would wait for it without end
+    except Exception:  # on one rank: the others would wait for it forever
         traceback.print_exc()
         MPI.COMM_WORLD.Abort(1)
     raise SystemExit(code)

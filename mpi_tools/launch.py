@@ -19,7 +19,7 @@ import sys
 import threading
 from pathlib import Path
 
-sys.path.append(str(Path(__file__).parents[1] / "src"))  # of this checkout, where no eddies is installed yet
+sys.path.append(str(Path(__file__).parents[1] / "src"))  # of this checkout, if eddies is not installed yet
 from eddies.cores import check_threads, default_to_one_thread, is_positive, local_cores, threads  # noqa: E402
 
 # The frame of mpirun's notices, the beginnings of those about a rank with a non-zero exit code, and the exit codes that
@@ -157,7 +157,7 @@ def run_job(line: list[str], environment: dict[str, str]) -> int:
 def main() -> None:
     """Run the command and exit with its code."""
     parser = argparse.ArgumentParser(description="Start a command on this machine's cores under mpirun.")
-    parser.add_argument("-n", dest="ranks", help="number of ranks (default: one per core)")
+    parser.add_argument("-n", dest="ranks", help="number of ranks (default: as many as fit the cores)")
     parser.add_argument("command", nargs="+")
     given = parser.parse_args()
     try:

@@ -26,7 +26,7 @@ packages='import sysconfig; print(sysconfig.get_path("purelib"))'
 cd "$work"
 export OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
 found=$(clean/bin/python -c 'import eddies; print(eddies.__file__)')
-case $found in "$work"/clean/*) ;; *) echo "package_test: $found is not of the wheel" >&2; exit 1 ;; esac
+case $found in "$work"/clean/*) ;; *) echo "package_test: $found is not from the wheel" >&2; exit 1 ;; esac
 kernels='from eddies.kernels.library import in_use; print(in_use())'
 [ "$(clean/bin/python -c "$kernels")" = "$("$shared/bin/python" -c "$kernels")" ] ||
     { echo "package_test: the wheel lacks compiled kernels" >&2; exit 1; }

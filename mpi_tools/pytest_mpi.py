@@ -8,8 +8,8 @@ The pytest process that the user starts (outer) never initialises MPI, because O
 process that has. It starts one `mpirun -n RANKS python -m pytest MODULES` (inner) for all selected tests with the same
 number of ranks, because starting ranks takes longer than most tests. Every rank writes JSON lines, from which each test
 is reported. If the ranks disagree about a test, or it exceeds its time limit, that mpirun ends and a new one runs the
-tests after it. Tests run in the order of their ranks. Several mpirun share the modules with tests on one rank. All
-ranks of a test have the same `tmp_path`, but not the same `tmp_path_factory`.
+tests after it. Tests run in the order of their numbers of ranks. Several mpirun share the modules with one-rank tests.
+All ranks of a test have the same `tmp_path`, but not the same `tmp_path_factory`.
 """
 
 import gc
@@ -37,7 +37,7 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    gc.disable()  # imports of a collection make millions of objects and no garbage
+    gc.disable()  # imports during collection make millions of objects and no garbage
     config.addinivalue_line("markers", "mpi(*ranks, timeout=120): run under mpirun on these numbers of ranks")
     folder = config.getoption("--mpi-run")
     if folder:
@@ -111,7 +111,7 @@ class OuterRun:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session):
-        """Start the tests on one rank beside each other and beside those without ranks, to keep all cores busy."""
+        """Start several mpirun for the tests on one rank, beside the tests without ranks, to keep all cores busy."""
         group, cores, shown = self.waiting.get(1), local_cores(), session.config.option.capture == "no"
         if group and cores > 1 and not shown and not session.config.option.collectonly:
             os.environ.setdefault("OMPI_MCA_mpi_yield_when_idle", "1")  # a waiting rank yields its core
@@ -127,7 +127,7 @@ class OuterRun:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_makereport(self, item, call):
-        """Report the seconds of the slowest rank, not those of waiting for it."""
+        """Report the seconds that the slowest rank took, without the time of waiting for its result."""
         report = yield
         if call.when == "call" and isinstance(item, MpiItem):
             report.duration = item.seconds
@@ -169,7 +169,7 @@ class RankFailure(Exception):
 
 
 class MpiItem(pytest.Item):
-    """Stands for a test function that another mpirun executes."""
+    """Represents a test function that an mpirun executes."""
 
     @classmethod
     def replace(cls, function, outer):
@@ -285,9 +285,9 @@ class RankRun:
         ours = [index for index, line in enumerate(stack) if "_pytest" in line]
         stack = stack[:ours[0]] if ours else stack
         if stack and stack[0].startswith("Timeout"):
-            text = f"not at its end after the time limit of {item.timeout:g} s:\n"
+            text = f"did not end within the time limit of {item.timeout:g} s:\n"
         elif stack:
-            text = "not at its end when the others had ended:\n"
+            text = "had not ended when the others had:\n"
         else:
             self.output.seek(0)
             stack = self.output.read().decode(errors="replace").splitlines()[-60:]

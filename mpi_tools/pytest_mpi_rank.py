@@ -16,7 +16,7 @@ GRACE = 3.0  # seconds in which the other ranks must end a test that has failed 
 
 
 class InnerRun:
-    """Runs on this rank the tests of FOLDER/tests.json in free modules, and writes FOLDER/RANK.jsonl."""
+    """Runs on this rank the tests of FOLDER/tests.json in modules that this run takes, and writes FOLDER/RANK.jsonl."""
 
     def __init__(self, folder: Path):
         # A communicator of its own: messages that a failing test leaves on COMM_WORLD cannot arrive here.
@@ -46,7 +46,7 @@ class InnerRun:
         return True
 
     def take(self, number: int) -> bool:
-        """Return whether this run has the module of this number."""
+        """Take the module of this number if no run has it; return whether this run has it."""
         link = self.taken / str(number)
         with contextlib.suppress(FileExistsError):
             link.symlink_to(self.folder)

@@ -21,7 +21,7 @@ BAD_TEXTS = [
     ('name = "../../evil"\n' + FLOW + TIME, 'name = "../../evil": must be the name of a directory'),
     (FLOW, "[time] duration: this key is missing"),
     (FLOW + '[initial]\nkind = "file"\n' + TIME, "[initial] path: this key is missing"),
-    (FLOW + '[initial]\nkind = "sound-wave"\n' + TIME, "needs sound; set [flow] fluid"),
+    (FLOW + '[initial]\nkind = "sound-wave"\n' + TIME, "sound needs a compressible fluid; set [flow] fluid"),
     (SOUND + '[initial]\nkind = "sound-wave"\n' + LEARNING, '[initial] kind = "sound-wave": starts from rest'),
     (FLOW.replace("0.1", "0") + '[initial]\nkind = "shear-wave"\n' + LEARNING + MODEL + 'preset = "resolved"\n',
      '[initial] kind = "shear-wave": without viscosity'),
@@ -68,11 +68,11 @@ BAD_OVERRIDES = [
     ("kernel.hidden=[]", "[kernel] hidden = []: must be a list such as [16, 16] of whole numbers, each at least 1"),
     ("kernel.hidden=16", "[kernel] hidden = 16: must be a list such as [16, 16]"),
     ("model.pairs.hidden=[16, 0]", "[model.pairs] hidden = [16, 0]: must be a list such as [16, 16]"),
-    ('title=""', 'title = "": must be a text in quotes'),
+    ('title=""', 'title = "": must be a string in quotes'),
     ('name="a\\u0000b"', 'must be the name of a directory'),
     ("name=-n", 'name = "-n": must be the name of a directory'),
     ("device=tpu", 'device = "tpu": must be one of "cpu", "cuda"'),
-    ("training.truths=runs/a", '[training] truths = "runs/a": must be a list of texts'),
+    ("training.truths=runs/a", '[training] truths = "runs/a": must be a list of strings'),
     ("training.horizons.steps=0", "[training.horizons] steps = 0: must be a whole number at least 1"),
     # An unknown key, section, word or import path.
     ("flow.cels=16", "[flow] cels: no such key; did you mean cells?"),
@@ -103,12 +103,12 @@ BAD_OVERRIDES = [
     ("time.duration=3", "[time] duration = 3: with [tracers] the run time is [tracers] turnovers"),
     ("tracers.field_cells=32", "[tracers] field_cells = 32: must be at most [flow] cells = 24"),
     ("kernel.neighbors=2000", "half the cube is 3.14; lower neighbors or raise [tracers] particles_per_side"),
-    ("model.neighbors=2000", "[model] neighbors = 2000: 1728 particles reach 4.5"),
-    ('model.terms=["pressure", "continuity"]', '"continuity" its rate, which are two densities'),
+    ("model.neighbors=2000", "[model] neighbors = 2000: with 1728 particles the radius and skin are 4.5"),
+    ('model.terms=["pressure", "continuity"]', '"continuity" gives its rate, so it is given twice'),
     ('model.terms=["pairs"]', '"pairs" reads the density, which no term gives'),
     ("training.window=1", "[simulation] start: this key is missing"),
     ("training.truths=[]", "[training] truths = []: is empty; name one or more run directories"),
-    ('training.truths=["a", "b", "c", "d", "e"]', "[training] frames = 8: the 5 truths need 2 each, 10 in all"),
+    ('training.truths=["a", "b", "c", "d", "e"]', "[training] frames = 8: the 5 truths need 2 frames each, 10 in all"),
     ("training.batch=5000", "[training] batch = 5000: must be at most the number of particles, 1728"),
     ("training.combined_steps=0", "set both the steps and a weight above 0, or neither"),
     ("training.combined_steps=100", "[training] combined_steps = 100: must be at most steps = 60"),
@@ -126,8 +126,8 @@ BAD_OVERRIDES = [
 
 # Allowed values of the scene tiny with which a stage could not end.
 INFEASIBLE = [
-    ("initial.amplitude=1e-12", "[initial] amplitude = 1e-12: an energy of 1.5e-24, to which [forcing] injection_rate "
-     "= 0.5 adds 0.025 in one step of 0.05, which is unstable; raise amplitude to 0.018 or more"),
+    ("initial.amplitude=1e-12", "[initial] amplitude = 1e-12: the flow has the energy 1.5e-24, and [forcing] "
+     "injection_rate = 0.5 adds 0.025 in one step of 0.05, which is unstable; raise amplitude to 0.018 or more"),
     ("flow.viscosity=1e3", "[flow] viscosity = 1000: Re_lambda would be 0.2, and less than exp(-1.39e+03) of the"),
     ("flow.viscosity=1e14", "lower viscosity or turnovers"),
     ("tracers.turnovers=1e12", "less than exp(-1.39e+11) of the flow's energy"),
@@ -139,9 +139,9 @@ INFEASIBLE = [
     ("tracers.frame_interval=1e-12", "[tracers] frame_interval = 1e-12: 7.0e+11 steps"),
     ("simulation.step=1e-12", "[simulation] step = 1e-12: 3.5e+11 steps"),
     ("simulation.turnovers=1e12", "[simulation] step = 0.08: 1.5e+13 steps of 0.08 for a time of 1.16e+12"),
-    ("simulation.frame_interval=2.0", "with at most 106 frames, as expected of [tracers] turnovers = 0.6: "
-     "[simulation] start: from frame 52 of 106 on, no filtered field is followed by ground truth for 2"),
-    ("simulation.start=0.99", "[simulation] start: from frame 103 of 106 on, no filtered field is followed by ground"),
+    ("simulation.frame_interval=2.0", "[tracers] turnovers = 0.6 is expected to give at most 106 frames: "
+     "[simulation] start: from frame 52 of 106 on, no frame has a filtered field and one more frame"),
+    ("simulation.start=0.99", "[simulation] start: from frame 103 of 106 on, no frame has a filtered field"),
     ("tracers.field_every=500", "[tracers] field_every: no filtered field is stored between the first and the last"),
     ("tracers.turnovers=0.01", "[training] window = 0.5: holds 2 frames of the ground truth, too few with 2 held out"),
     ("training.window=0.01", "[training] window = 0.01: holds 2 frames of the ground truth, too few with 2 held out "

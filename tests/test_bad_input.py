@@ -112,11 +112,11 @@ def test_damaged_seconds(comm, tmp_path, capfd):
 
 
 PATHS = [
-    (["run", TINY, "--output", ""], "an empty text is no directory"), (["export", ""], "an empty text"),
+    (["run", TINY, "--output", ""], "an empty text is not a directory"), (["export", ""], "an empty text"),
     (["run", "compare-small", "--output", LONG], "File name too long"), (["report", LONG], "File name too long"),
     (["check", LONG], "(300 characters): cannot be read: File name too long; give the path of a TOML file"),
     (["check", "."], ".: is a directory, not a scene"), (["scenes", "tin"], "tin: no such scene; did you mean tiny?"),
-    (["export", "."], ".: holds no fields or particles"), (["report", "."], ".: holds none of ground_truth.h5")]
+    (["export", "."], ".: has no fields or particles"), (["report", "."], ".: holds none of ground_truth.h5")]
 
 
 @pytest.mark.mpi(1, 2)

@@ -334,7 +334,7 @@ def test_a_second_job_is_refused_and_may_take_over(tmp_path):
     third = launch(2, *line, "--take-over")
     assert "takes over" in third.communicate(timeout=60)[0] and third.returncode == 75
     output += first.communicate(timeout=60)[0]
-    assert first.returncode == 2 and output.count("taken this run directory over") == 1
+    assert first.returncode == 2 and output.count("taken over this run directory") == 1
     assert "Traceback" not in output and not (tmp_path / "run/LOCK").exists()
 
 

@@ -39,7 +39,8 @@ def text_of(page):
     return "\n\n".join("".join(cell["source"]) for cell in json.loads(text)["cells"] if cell["cell_type"] == "markdown")
 
 
-README, TEXT = text_of(PAGES[0]), "\n".join(map(text_of, PAGES))
+README = text_of(PAGES[0])
+TEXT = "\n".join(text_of(page) for page in PAGES if page.stem != "from-1.0")  # which names what was removed
 
 
 def blocks(language):
@@ -168,7 +169,7 @@ def allowed(rule):
         return "`true`, `false`"
     if rule.kind is str and words:
         return ("list of " if rule.many else "") + ", ".join(words) + (" or an import path" if rule.paths else "")
-    noun = {float: "number", int: "integer", str: "text"}[rule.kind]
+    noun = {float: "number", int: "integer", str: "string"}[rule.kind]
     symbols = {"above": ">", "at_least": "≥", "below": "<", "at_most": "≤"}
     limits = " and ".join(f"{symbols[name]} {'π' if bound == BOX_LENGTH / 2 else format(bound, 'g')}"
                           for name, bound in rule.bounds.given.items())

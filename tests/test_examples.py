@@ -58,7 +58,7 @@ def test_ten_lines_set_a_rollout_going(smaller, caplog, monkeypatch):
     program = re.search(r"^```python\n(import dataclasses\n.*?)^```", page, re.MULTILINE | re.DOTALL)[1]
     with caplog.at_level(logging.INFO, "eddies"):
         exec(compile(program, "python.md", "exec"), {})
-    assert caplog.text.count("rollout: complete") == 2
+    assert caplog.text.count("; complete\n") == 2
     assert list(results(smaller / "runs" / "mine")[1]) == ["pressure", "relaxation", "pairs"]
 
 

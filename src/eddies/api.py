@@ -29,8 +29,8 @@ CHECKPOINT_SECONDS = 600.0
 
 
 def check(scene: Scene | str | Path, *, comm: Comm | None = None) -> None:
-    """Log estimates of a scene: resolution, memory, ranks and time. Writes no file. Raises SceneError where a run would
-    be refused."""
+    """Log estimates of a scene: resolution, memory, ranks and time. Writes no file. Raises SceneError if a run would be
+    refused."""
     with _job(comm) as comm:
         import_module("eddies.workflows.check").run(scene if isinstance(scene, Scene) else load_scene(scene), comm)
 
@@ -48,7 +48,7 @@ def run(scene: Scene | str | Path, *, stages: Sequence[str] | None = None, outpu
     variants : the variants to run; empty for all.
     comm : the communicator; None for all ranks of the job.
 
-    Raises UserError for an unknown stage, and as `stages.run_stages`.
+    Raises UserError for an unknown stage, and the errors of `stages.run_stages`.
     """
     unknown = [name for name in stages or () if name not in STAGES]
     if unknown:
@@ -81,9 +81,9 @@ def simulate(scene: Scene | str | Path, *, output: str | Path | None = None, ove
 def _job(comm: Comm | None) -> Iterator[Comm]:
     """The communicator of a job, by default the one of all ranks.
 
-    Log lines go to standard output unless the program has set up logging. An error of several ranks ends the job if
-    only some of them meet it, because the others may wait for them, or if HDF5 could not write a file, because HDF5
-    then crashes at exit.
+    Log lines go to standard output unless the program has set up logging. With several ranks, MPI_Abort ends the job
+    if only some of them meet an error, because the others may wait for them, and if HDF5 could not write a file,
+    because HDF5 then crashes at exit.
     """
     default_to_one_thread()
     from mpi4py import MPI

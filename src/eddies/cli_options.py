@@ -44,8 +44,8 @@ def parse_arguments(arguments: list[str] | None, rank: int) -> argparse.Namespac
 def build_parser() -> argparse.ArgumentParser:
     """The parser with all sub-commands."""
     parser = argparse.ArgumentParser(prog="eddies", description=eddies.__doc__,
-                                     epilog="EDDIES_LOG = debug (as --verbose), info, outcome (as --quiet) or warning "
-                                            "sets what is logged.")
+                                     epilog="The variable EDDIES_LOG sets what is logged: debug (as --verbose), info, "
+                                            "outcome (as --quiet) or warning.")
     parser.add_argument("--version", action="version", version=f"eddies {eddies.__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", dest="command", required=True)
     for name, about in {"run": "every stage of the scene, in order",
@@ -57,35 +57,35 @@ def build_parser() -> argparse.ArgumentParser:
         add_job_options(command, "run directory (default: runs/NAME)")
     report = add_command(commands, "report", STAGES["report"].about)
     add_run(report, "run")
-    add_variants(report, "show this variant after the table of all; repeatable, the first counts")
+    add_variants(report, "show the first of these that was run, after the table of all variants; repeatable")
     add_log_options(report)
     report.add_argument("--output", type=directory, metavar="DIR",
-                        help="write the page there instead of RUN/report, such as for a run that cannot be written")
+                        help="write the page there instead of RUN/report, for example if RUN is read-only")
     report.add_argument("--open", action="store_true", help="show the page in a browser")
     export = add_command(commands, "export", "fields and particles of a run directory, for other programs")
     add_run(export, "run")
     export.add_argument("--variant", metavar="NAME", help="export the rollout of this variant")
     export.add_argument("--format", choices=["vtkhdf", "lagrangebench"], default="vtkhdf",
-                        help="for ParaView, or particles as learned simulators read them (default: vtkhdf)")
+                        help="vtkhdf: for ParaView; lagrangebench: for learned simulators (default: vtkhdf)")
     export.add_argument("--output", type=directory, metavar="DIR", help="where the files go (default: RUN/FORMAT)")
     add_log_options(export)
-    check = add_command(commands, "check", "derived numbers, memory, ranks and time; leaves nothing")
+    check = add_command(commands, "check", "derived numbers, memory, ranks and time; writes no files")
     add_scene_options(check)
     add_variants(check, "check this variant in place of the scene; repeatable")
     how = check.add_mutually_exclusive_group()
     how.add_argument("--json", action="store_true", help="the numbers as JSON, for programs")
     how.add_argument("--time", action="store_true", help="run a few steps of each stage, and estimate its time")
-    scenes = add_command(commands, "scenes", "the built-in scenes, a line each; or one with all settings")
+    scenes = add_command(commands, "scenes", "the built-in scenes, one per line; or one scene with all settings")
     scenes.add_argument("scene", nargs="?", metavar="SCENE", help="print this scene with all keys, also absent ones")
     scenes.add_argument("--schema", action="store_true", help="print the JSON schema of scenes, for editors")
     status = add_command(commands, "status", "the state of run directories: stages, checkpoints, jobs, sizes")
     status.add_argument("directory", nargs="?", type=directory, default=Path("runs"), metavar="DIR",
-                        help="a run directory, or one of several (default: runs)")
+                        help="a run directory, or a directory that holds several (default: runs)")
     status.add_argument("--verify", action="store_true", help="compare all bytes of the products with their checksums")
     diff = add_command(commands, "diff", "the differences between two runs: settings and numbers")
     add_run(diff, "one")
     add_run(diff, "other", nargs="?")
-    add_variants(diff, "of both runs; or, given twice, of one run")
+    add_variants(diff, "compare this variant of both runs; given twice, two variants of one run")
     return parser
 
 
@@ -108,7 +108,7 @@ class OptionError(UserError):
 def directory(text: str) -> Path:
     """A directory of the command line, which may not exist yet."""
     if not text:
-        raise OptionError("an empty text is no directory; give the name of one, or . for the working directory")
+        raise OptionError("an empty text is not a directory; give a name, or . for the working directory")
     try:
         Path(text).exists()
     except OSError as error:
@@ -130,7 +130,7 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", dest="overrides",
                         help="change a key of the scene; repeatable")
     parser.add_argument("--unset", action="append", default=[], metavar="SECTION[.KEY]", dest="removals",
-                        help="leave a key or a section of the scene out, before any --set; repeatable")
+                        help="remove a key or a section of the scene, before any --set; repeatable")
 
 
 def add_variants(parser: argparse.ArgumentParser, about: str) -> None:
@@ -156,6 +156,6 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that set how much is logged."""
     how_much = parser.add_mutually_exclusive_group()
     how_much.add_argument("--quiet", action="store_const", const="outcome", dest="log",
-                          help="log only warnings, and at the end the product and its place")
+                          help="log only warnings, and at the end the path of the product")
     how_much.add_argument("--verbose", action="store_const", const="debug", dest="log",
                           help="log each step, and the time of frames, checkpoints and parts of the report")

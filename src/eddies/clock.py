@@ -13,9 +13,9 @@ from contextlib import contextmanager
 log = logging.getLogger("eddies")
 
 YEAR = 365.25 * 86400.0      # seconds
-YEARS = 10                   # from which a duration is given in years
+YEARS = 10                   # longer durations are given in years
 WARM_UP_STEPS = 2            # first steps, which plan, compile and fill caches; the median leaves them out
-RECENT = 1000                # latest steps, whose median the progress line gives
+RECENT = 1000                # number of latest steps whose median the progress line gives
 
 
 class Clock:
@@ -64,8 +64,8 @@ class ProgressLine:
     """Logs a line every few seconds of wall time, with --verbose after every step: progress and remaining time. Call it
     after every step.
 
-    Seconds of a step are the median without the first two steps and without `storing`, whose share of the wall time is
-    given apart.
+    The seconds per step are a median, without the first two steps and without the time of `storing`, whose share of the
+    wall time is given separately.
 
     Parameters
     ----------

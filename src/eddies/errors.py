@@ -2,4 +2,4 @@
 
 
 class UserError(Exception):
-    """The text names the mistake and the remedy. A command that ends with it prints one line; exit code 2."""
+    """The text names the mistake and the remedy. A command that ends with it prints one line and has exit code 2."""

@@ -1,6 +1,6 @@
 """Import paths "module:name" of a user's own classes and functions.
 
-A path is imported where a scene or a program of the user names it, and nowhere else: never because a file does.
+A path is imported only if a scene or a program of the user names it, never because a stored file names it.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from eddies.errors import UserError
 
 
 class ImportPathError(UserError, ValueError):
-    """An import path leads nowhere."""
+    """The object of an import path cannot be imported."""
 
 
 def is_path(name: str) -> bool:
-    """Whether a name is an import path, not a word."""
+    """Whether a name is an import path, not a built-in name."""
     return ":" in name
 
 
 def short_name(name: str) -> str:
-    """Return the name in sections and logs: the word, or the part of an import path after the colon."""
+    """Return the name for sections and logs: the built-in name, or the part of an import path after the colon."""
     return name.rpartition(":")[2]
 
 
@@ -42,7 +42,7 @@ def search_in(folder: str | Path) -> None:
 def load(path: str) -> Any:
     """Import the object of an import path.
 
-    Raises ImportPathError for another form, a missing module or name, or a module that raises while it is imported.
+    Raises ImportPathError if the form is wrong, the module or name is missing, or the import raises an exception.
     """
     module_name, _, name = path.partition(":")
     if not module_name or not name.isidentifier():
@@ -64,7 +64,7 @@ def load(path: str) -> Any:
 def users_code(called: Any, problem: type[UserError], hint: str = "") -> Iterator[None]:
     """Convert an exception of a user's class or function into a `problem` with its name, file and line.
 
-    Errors of this package and of its own classes pass unchanged. `hint` ends the text.
+    Errors of this package and of its own classes pass unchanged. `hint` is added to the end of the text.
     """
     try:
         yield

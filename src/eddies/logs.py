@@ -32,7 +32,7 @@ class Output:
     """Replaces standard output while a command runs.
 
     Characters that the encoding lacks are written as "\\u2264". A line that cannot be written, as on a full disk, does
-    not end the run; `end` reports it, unless the reader of a pipe has left, such as `head`.
+    not end the run; `end` reports it, unless the reader of a pipe, such as `head`, has closed it.
     """
 
     def __init__(self) -> None:

@@ -17,7 +17,7 @@ class Stage:
         workflows/run_directory/fingerprints.py).
     depends_on : all stages on which its product depends, if the scene has them.
     checkpoints : directory of its checkpoints in the run directory; None without checkpoints.
-    but : keys "section.key" of those sections on which its product does not depend.
+    but : keys "section.key" in `reads` on which its product does not depend.
     """
 
     name: str
@@ -48,10 +48,10 @@ STAGES = {stage.name: stage for stage in (
     Stage("train", "the model of the particles", "model", "model",
           ("device", "model", "weights", "training", "truths", "own_model"),
           ("dns", "train-kernel"), "checkpoints-train"),
-    Stage("find-step", "the cheapest step of the rollout that has converged", "simulation", "step",
+    Stage("find-step", "the cheapest time step with which the rollout has converged", "simulation", "step",
           ("device", "simulation", "confirming", "window", "truths", "eulerian", "own_simulation"),
           ("dns", "train-kernel", "train"), None, but=("simulation.turnovers", "simulation.start")),
-    Stage("simulate", "the trained model, without the direct simulation", "simulation", "rollout",
+    Stage("simulate", "the rollout of the trained model, without the direct simulation", "simulation", "rollout",
           ("device", "simulation", "found_step", "window", "truths", "eulerian", "own_simulation"),
           ("dns", "train-kernel", "train", "find-step"), "checkpoints-rollout"),
     Stage("report", "figures, one page and metrics.json of a run directory", None, None,

@@ -39,11 +39,6 @@ from eddies.workflows.variants import Step, steps
 
 log = logging.getLogger("eddies")
 
-# The modules of the stages, imported when their stage runs: run(directory, comm, variants, stop) of the report,
-# run(scene, comm, directory, stop) of the others.
-MODULES = {"dns": "dns", "train-kernel": "train_kernel", "reconstruct": "reconstruct", "train": "train",
-           "find-step": "find_step", "simulate": "simulate", "report": "report"}
-
 
 class VariantsFailed(UserError):
     """Some variants of a scene failed."""
@@ -59,7 +54,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     failure of a variant does not stop the others.
 
     Raises:
-        Stopped: `stop` requested it; the running stage has kept what the next run needs.
+        Stopped: `stop` requested it; the running stage has stored what the next run needs.
         SceneError: a file STOP is present at the start, or the scene lacks a section, cannot use as many ranks, makes
             too large a file for rank 0 to write, or differs from the scene of an input.
         RunInUse, RunTakenOver: another job works in the directory, or has taken it over.
@@ -146,7 +141,7 @@ def run_steps(planned: Sequence[Step], comm: Comm, directory: Path, stop: StopRe
 def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None:
     """Run the stages of a step that are not done, in its directory, whose lock is held."""
     scene, directory = step.scene, step.directory
-    if step.links:  # other inputs were checked before any step
+    if step.links:  # the other inputs were checked before the first step
         check_inputs(step, comm)
     work = look_at_work(step, comm, overwrite)
     if has_single_writer(comm):
@@ -188,12 +183,13 @@ def working_in(comm: Comm, directory: Path, stop: StopRequest, take_over: bool) 
 
 def run_stage(name: str, arguments: Sequence[Any], comm: Comm, directory: Path, stop: StopRequest,
               begun: bool) -> None:
-    """Run one stage with its arguments and record its wall time, also if it is stopped. If it had `begun` before, times
-    are added."""
+    """Run one stage with its arguments and record its wall time, also if it is stopped. If it had `begun` before, its
+    times are added."""
     log.info("%s: starts on %d %s", name, comm.size, "rank" if comm.size == 1 else "ranks")
     start = time.perf_counter()
     of_tracks = name == "dns" and arguments[0].tracks is not None
-    run = import_module(f"eddies.workflows.{'tracks' if of_tracks else MODULES[name]}").run
+    # run(directory, comm, variants, stop) of the report, run(scene, comm, directory, stop) of the others
+    run = import_module(f"eddies.workflows.{'tracks' if of_tracks else name.replace('-', '_')}").run
     stop.check()
     try:
         run(*arguments)
@@ -206,9 +202,9 @@ def run_stage(name: str, arguments: Sequence[Any], comm: Comm, directory: Path, 
 
 
 def check_inputs(step: Step, comm: Comm, made: Collection[Path] = ()) -> None:
-    """Raise SceneError or ProductError if an input of a step is missing, unfit or of other settings.
+    """Raise SceneError or ProductError if an input of a step is missing, not usable or of other settings.
 
-    Files that are `made` first by the same job are not checked.
+    Files in `made`, which the same job makes first, are not checked.
     """
     stages, scene = step.stages, step.scene
     weights = scene.model.weights_file if "train" in stages and scene.model is not None else None
@@ -240,7 +236,7 @@ def prepare_directory(text: str, comm: Comm, directory: Path) -> None:
 
 def record_seconds(stage: str, seconds: float, comm: Comm, directory: Path, begun: bool) -> float:
     """Record the wall time of a stage in stage_seconds.json and return it. If the stage had `begun` before, the time of
-    its earlier runs is added, as far as they were not killed."""
+    its earlier runs is added, except of those that were killed."""
     path = directory / SECONDS
 
     def record() -> float:

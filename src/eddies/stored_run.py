@@ -117,8 +117,8 @@ class StoredRun:
     def trajectories(self, ids: Any = None, of: str = "model", unwrapped: bool = False) -> Any:
         """Position, velocity and other columns of all particles or those with these ids.
 
-        `of` is "model" or "truth" for the rollout, or "tracers" for the ground truth. Positions that are `unwrapped`
-        are continuous beyond the periodic cube.
+        `of` is "model" or "truth" for the rollout, or "tracers" for the ground truth. With `unwrapped`
+        positions are continuous beyond the periodic cube.
         """
         found = self[chosen(TRAJECTORIES, of)]
         if ids is not None and not isinstance(ids, slice):
@@ -132,8 +132,8 @@ class StoredRun:
             found = found.sel(particle=ids)
         if unwrapped:
             if "image" not in found:
-                raise UserError(f"{self.path}: its particles have no image, because eddies before 1.0 made them; make "
-                                "them again")
+                raise UserError(f"{self.path}: its particles have no column image, because a version of eddies before "
+                                "1.0 made them; make them again")
             position = found["position"]
             path = np.asarray(position) + 2 * np.pi * np.asarray(found["image"])
             if isinstance(found, dict):
@@ -145,7 +145,7 @@ class StoredRun:
         """A field on its grid, (component, z, y, x), at the stored time nearest to `time`, or the last.
 
         `of` is "filtered" or "unfiltered" for the flow, "final" for a run without tracers, "reconstructed" for the
-        fields of [reconstruction], or "model" or "truth" for the field that the kernel makes of the particles.
+        fields of [reconstruction], or "model" or "truth" for the field that the kernel makes from the particles.
         """
         return at_time(self[chosen(FIELDS, of)], name, time)
 
@@ -196,7 +196,7 @@ def chosen(table: dict[str, Any], of: str) -> Any:
 
 
 def check_ids(ids: np.ndarray, count: int) -> None:
-    """Raise UserError for ids that are no particles of a run with so many."""
+    """Raise UserError for ids that are not integers from 0 to count - 1."""
     if ids.size and (ids.dtype.kind not in "iu" or not 0 <= ids.min() <= ids.max() < count):
         raise UserError(f"ids = {shortened(str(ids.tolist()))}: must be integers from 0 to {count - 1}, the particles "
                         "of the run")

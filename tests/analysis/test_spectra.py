@@ -1,34 +1,12 @@
 import numpy as np
 import pytest
 
-from eddies.analysis.spectra import band_ratios, energy_spectrum, spectrum_error, vorticity
+from eddies.analysis.spectra import band_ratios, spectrum_error, vorticity
 
 
 def grid(cells):
     x = 2 * np.pi * np.arange(cells) / cells
     return np.meshgrid(x, x, x, indexing="ij")[::-1]
-
-
-@pytest.mark.parametrize("mode, shell", [
-    ((3, 0, 0), 3), ((0, 2, 0), 2), ((0, 0, 4), 4), ((1, 2, 2), 3), ((1, 1, 0), 1),
-])
-def test_single_mode_lies_in_its_shell(mode, shell):
-    x, y, z = grid(12)
-    velocity = np.zeros((3, 12, 12, 12))
-    velocity[1] = 0.7 * np.cos(mode[0] * x + mode[1] * y + mode[2] * z)
-    wavenumber, energy = energy_spectrum(velocity)
-    assert energy[shell] == pytest.approx(0.7**2 / 4)
-    assert np.allclose(np.delete(energy, shell), 0)
-    assert wavenumber[shell] == shell
-
-
-@pytest.mark.parametrize("cells", [7, 8])
-def test_parseval(cells):
-    velocity = np.random.default_rng(2).normal(size=(3, cells, cells, cells))
-    _, energy = energy_spectrum(velocity)
-    assert energy.sum() == pytest.approx(0.5 * np.mean(np.sum(velocity**2, axis=0)), rel=1e-13)
-    with pytest.raises(ValueError, match="shape"):
-        energy_spectrum(velocity[..., 1:])
 
 
 def test_a_factor_in_every_shell_is_an_error_of_its_logarithm():

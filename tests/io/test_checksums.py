@@ -70,8 +70,8 @@ def test_a_reader_of_a_frame_is_told_of_its_bytes_alone(comm, path):
             read_frame(file["series"], 2, whole)
         assert np.array_equal(read_frame(file["series"], 4, whole), values(4))
     message = str(error.value)
-    assert message.startswith(f"{path}: series, frame 2 (bytes ") and "\n" not in message
-    assert "damaged" in message and "run `eddies simulate` again" in message
+    assert message.startswith(f"{path}: the file is damaged: wrong checksum of series, frame 2 (bytes ")
+    assert "\n" not in message and "run `eddies simulate` again" in message
 
 
 @pytest.mark.mpi(1)
@@ -153,7 +153,7 @@ def test_every_changed_byte_is_found(comm, path):
 def test_another_or_a_missing_file_is_found(comm, path, tmp_path):
     known = known_sums(path)
     assert find_damage(comm, path, known) is None
-    assert "is another file" in find_damage(comm, path, known + 1)
+    assert "is not the file that was written" in find_damage(comm, path, known + 1)
     assert "nowhere.h5: missing" in find_damage(comm, tmp_path / "nowhere.h5")
 
 

@@ -140,7 +140,7 @@ def test_an_unreadable_lock_holds_while_it_is_new(comm, tmp_path):
 @pytest.mark.usefixtures("quick")
 def test_a_job_that_lost_its_directory_ends_and_touches_nothing(comm, tmp_path):
     stop, partial = StopRequest(comm), tmp_path / "kernel.h5.partial"
-    with pytest.raises(RunTakenOver, match=r"another job has taken this run directory over \(process"):
+    with pytest.raises(RunTakenOver, match=r"another job has taken over this run directory \(process"):
         with lock_directory(comm, tmp_path) as loss, stop.watching(loss):
             assert not stop()
             with create_product(comm, tmp_path / "kernel.h5", "kernel", {}):

@@ -100,7 +100,7 @@ def changed(rows, **changes):
 
 @pytest.mark.parametrize("changes, words", [
     ({"positions": np.nan}, "position of track .* not finite"), ({"times": np.inf}, "time of track .* not finite"),
-    ({"ids": 1, "times": 0.0}, "track 1 is there twice at time 0"), ({"ids": -5}, "whole numbers from 0")])
+    ({"ids": 1, "times": 0.0}, "track 1 appears twice at time 0"), ({"ids": -5}, "whole numbers from 0")])
 def test_rows_that_are_none_are_refused_before_anything_is_written(tmp_path, changes, words):
     with pytest.raises(ProductError, match=words):
         write_tracks(tmp_path / "t.h5", **changed(shear(np.array([0.0, 0.1, 0.2])), **changes))

@@ -90,8 +90,8 @@ def test_unknown_names_list_the_others(comm, tmp_path):
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("place, index, value, message", [
     ("time", 1, 1.0, "do not increase"), ("time", 2, np.nan, "do not increase"), ("id", 3, 4, "not in order"),
-    ("position/value", (1, 5, 0), -0.1, "frame 1: .*outside of 0 to 6.28319"),
-    ("position/value", (1, 5, 0), 6.3, "frame 1: .*outside of 0 to 6.28319"),
+    ("position/value", (1, 5, 0), -0.1, "frame 1: .*outside the range 0 to 6.28319"),
+    ("position/value", (1, 5, 0), 6.3, "frame 1: .*outside the range 0 to 6.28319"),
     ("density/value", (1, 5), np.inf, "frame 1: .*not finite"), ("time", None, 2, r"holds \(3, 11\) frames")])
 def test_malformed_trajectories_are_refused(comm, tmp_path, place, index, value, message):
     """Also one with less times (value) than frames."""

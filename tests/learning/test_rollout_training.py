@@ -11,7 +11,6 @@ from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_max
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
@@ -25,7 +24,7 @@ ITERATIONS = 8  # of each solve for the resolved velocity, on any number of rank
 
 def resolution(slab):
     """The resolved velocity, with ghost planes for particles that leave their slab within four intervals."""
-    return solving(ResolvedVelocity.on_slabs(slab, FlowUnits(SCALES, SUPPORT, 17), 2 * SPACING), ITERATIONS)
+    return solving(ResolvedVelocity.on_slabs(slab, SCALES, 2 * SPACING), ITERATIONS)
 
 
 def solving(resolved, iterations):

@@ -123,7 +123,7 @@ def test_failures_on_one_rank_hanging_and_dying_ranks_are_reported(failing):
     assert "Captured stdout of rank 1 call" in output and "value 41" in output
     assert "ValueError: raised while rank 0 is in a barrier" in output
     assert "failed in setup" in output and "in the fixture" in output
-    assert "rank 1 of 2 did not finish\nnot at its end after the time limit of 2 s" in output
+    assert "rank 1 of 2 did not finish\ndid not end within the time limit of 2 s" in output
     assert "test_made_up.py\", line 10 in test_hangs" in output
     assert "died; output of the run" in output
 

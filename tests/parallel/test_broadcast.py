@@ -3,7 +3,7 @@
 import pytest
 
 from eddies.errors import UserError
-from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank, require_same, share_text
+from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank, require_same
 from eddies.scene.values import KeyProblem, SceneError
 
 pytestmark = pytest.mark.mpi(1, 3)
@@ -47,9 +47,3 @@ def test_ranks_that_were_started_differently_are_refused(comm):
     if comm.size > 1:
         with pytest.raises(UserError, match="rank 2 was started with scene other, rank 0 with scene tiny"):
             require_same(comm, "other" if comm.rank == 2 else "tiny", "scene {}")
-
-
-@pytest.mark.parametrize("text", ["", "λ ≤ η", "\udcff.toml"])
-def test_text_of_any_bytes_is_shared(comm, text):
-    """Arguments hold bytes that are not UTF-8 as surrogates."""
-    assert share_text(comm, text if comm.rank == 0 else "other") == text

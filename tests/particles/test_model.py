@@ -218,7 +218,7 @@ def test_a_fault_that_shapes_do_not_show_is_found_before_training(comm):
             (lambda context, factor: factor * context.particles.velocity, None),
             (lambda context, factor: context.particles.velocity.clamp_(-0.1, 0.1), "in place; work on a copy"),
             (lambda context, factor: factor * context.particles.velocity / 0.0, "not finite with the initial"),
-            (lambda context, factor: factor.detach() * context.particles.velocity, "on the parameter factor, which")):
+            (lambda context, factor: factor.detach() * context.particles.velocity, "on the parameter factor, so it")):
         lagrangian = LagrangianModel({"own": Learned(acceleration)}, FLOW)
         context = dynamics_of(slab, lagrangian).context(particles)
         if complaint is None:

@@ -30,7 +30,7 @@ def units(side, width=2.0, **scales):
 
 
 def resolution_on(slab, side=SIDE, tolerance=1e-6):
-    resolution = ResolvedVelocity.on_slabs(slab, units(side))
+    resolution = ResolvedVelocity.on_slabs(slab, units(side).scales)
     resolution.tolerance = resolution.tolerance_predicted = resolution.tolerance_adjoint = tolerance
     return resolution
 
@@ -216,10 +216,10 @@ def test_the_resolved_velocity_is_solenoidal_and_what_it_misses_is_the_rest(comm
 @pytest.mark.mpi(1)
 def test_the_highest_wavenumber_is_that_of_particles_filter_or_turbulence(comm):
     slab = SlabDecomposition(comm, LENGTH, 56)
-    assert ResolvedVelocity.on_slabs(slab, units(32)).grid.resolved == 24
-    wide = ResolvedVelocity.on_slabs(slab, units(32, width=6.0)).grid.resolved
+    assert ResolvedVelocity.on_slabs(slab, units(32).scales).grid.resolved == 24
+    wide = ResolvedVelocity.on_slabs(slab, units(32, width=6.0).scales).grid.resolved
     assert np.exp(-(wide * 6 * LENGTH / 32) ** 2 / 24) >= 0.02 > np.exp(-((wide + 1) * 6 * LENGTH / 32) ** 2 / 24)
-    assert ResolvedVelocity.on_slabs(slab, units(32, kolmogorov_length=0.1)).grid.resolved == 10
+    assert ResolvedVelocity.on_slabs(slab, units(32, kolmogorov_length=0.1).scales).grid.resolved == 10
 
 
 # ---- predictions

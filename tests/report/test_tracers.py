@@ -16,3 +16,5 @@ def test_accelerations_are_in_units_of_kolmogorov(viscosity, dissipation_rate):
     scales = {"viscosity": viscosity, "dissipation_rate": dissipation_rate, "reynolds_lambda": 60.0}
     metrics = {metric.key: metric.value for metric in section(found, scales, 0.0).metrics}
     assert metrics["acceleration_constant"] == pytest.approx(1)
+    assert "follow the filtered flow" in section(found, scales, 0.0).text
+    assert section(found, scales, 0.0, filtered=False).text == "Tracers follow the whole flow. It is not forced."

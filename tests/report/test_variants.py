@@ -92,7 +92,7 @@ def test_the_section_has_notices_summary_notes_figure_and_table():
     assert all(text in part.text for text in (*TABLE.summary, "A note."))
     assert [figure.name for figure in part.illustrations] == ["error-against-run-time"]
     assert [metric.label for metric in part.metrics] == [r["name"] for r in ROWS]
-    assert part.metrics[0].value["wall s per T"] == 20.0
+    assert part.metrics[0].value["wall seconds per T"] == 20.0
     assert list(part.metrics[0].value)[:len(SHOWN)] == [MEASURES[name] for name in SHOWN]
     without = ErrorAgainstTime([{**each, "qr_kl": None} for each in ROWS], "learned")
     assert MEASURES["qr_kl"] not in section(without).metrics[0].value

@@ -38,6 +38,8 @@ def test_each_number_has_a_mark(changed, key, mark):
 def test_a_rollout_that_broke_is_poor_and_one_of_another_flow_is_not_judged():
     text, _ = verdict(stable=False, status="stopped: particle 3 is too fast")
     assert text.startswith("Poor: ") and "stopped: particle 3 is too fast" in text
+    text, _ = verdict(stable=False, status="complete")
+    assert text.startswith("Poor: the rollout is not finite to its end.")
     text, marks = verdict(two_flows=True)
     assert "not judged" in text and "good" not in text and not marks
 

@@ -141,7 +141,7 @@ def test_an_own_term_has_keys_of_its_own(tmp_path, own):
     ("class Bad(Term):\n    class Settings: pass\n", "its Settings must be a dataclass derived"),
     ("class Bad(Term):\n    class Settings(TermSettings):\n        a: float = 1\n", "write @dataclass(frozen=True)"),
     ("class Bad(Term):\n    @dataclass(frozen=True)\n    class Settings(TermSettings):\n        a: complex = 1j\n",
-     "Bad.Settings.a: complex: a key is declared by number, integer"),
+     "Bad.Settings.a: complex: declare the key by number, integer"),
     ("class Bad(Term):\n    @dataclass(frozen=True)\n    class Settings(TermSettings):\n"
      "        reads = ('vorticity',)\n", 'reads = ["vorticity"]: must be a tuple of any of "pairs", "resolved", '),
     ("class Bad: pass\n", "must be a class derived from eddies.Term"),
@@ -169,7 +169,7 @@ def test_a_density_that_no_term_reads_is_not_needed(tmp_path):
     refused('[model.pairs]: reads the density, which an incompressible flow does not have; leave "density" out of '
             '[model.pairs] inputs, or set [flow] fluid = "compressible"', lambda: read(
                 tmp_path, free, 'model.pairs.inputs=["distance", "density"]'))
-    refused('"density-flux" gives the density alone, which no term reads', lambda: read(
+    refused('"density-flux" gives only the density, which no term reads', lambda: read(
         tmp_path, free, 'model.terms=["pairs", "density-flux"]', 'model.pairs.inputs=["speed"]',
         'model.density-flux.inputs=["speed"]'))
     refused('[model.continuity]: reads the density, which an incompressible flow does not have; remove "continuity"',

@@ -64,8 +64,8 @@ def test_the_command_line_reaches_one_variant(tmp_path):
 
 
 BAD_OPTIONS = [
-    (["training.steps=3"], [], 'the variant "wide" changes this key itself; reach it by --set variant.wide.training.'),
-    ([], ["training"], 'the variant "wide" changes this key itself; reach it by --unset variant.wide.training'),
+    (["training.steps=3"], [], 'the variant "wide" changes this key itself; use --set variant.wide.training.'),
+    ([], ["training"], 'the variant "wide" changes this key itself; use --unset variant.wide.training'),
     (["variant.wid.training.steps=3"], [], 'there is no variant "wid"; did you mean wide? there are: plain, wide'),
     (["a.b.c.d=1"], [], "--set a.b.c.d=1: must be section.key=value"),
     ([], ["variant.plain.seed"], "--unset: variant.plain.seed: there is no such key or section to remove"),

@@ -82,9 +82,9 @@ def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, statio
             write_tracers(file, frames, density, total)
         if forced:
             write_attributes(file.create_group("forcing"), {"injection_rate": 0.5, "wavenumber": 2.0})
+        energy = np.outer(wiggle, decaying_spectra()["energy"][0])
+        write_table(file, "spectra_of_statistics", {"wavenumber": np.arange(energy.shape[1]), "energy": energy})
         if stationary:
-            spectra = np.outer(wiggle, decaying_spectra()["energy"][0])
-            write_table(file, "spectra_of_statistics", {"energy": spectra})
             write_attributes(file.create_group("stationary"), {"start": 1.0, "end": 3.0})
         write_attributes(file.create_group("reference"), reference)
 

@@ -157,7 +157,7 @@ def test_a_grid_starts_from_what_the_particles_tell(comm, folder, equations):
     """Also at a time at which the whole flow is not stored, from which the true modes cannot be taken."""
     form = ["simulation.method=eulerian", "eulerian.cells=16", "simulation.precision=float64", "simulation.start=0.3",
             "simulation.turnovers=0.04", f"eulerian.equations={equations}"]
-    with pytest.raises(SceneError, match="holds the unfiltered flow at"):
+    with pytest.raises(SceneError, match="holds the unfiltered flow "):
         simulate(comm, folder, *form)
     simulate(comm, folder, *form, "eulerian.start=particles")
     if comm.rank == 0:
@@ -197,7 +197,7 @@ def test_an_unstable_coarse_flow_ends_the_rollout(comm, folder, caplog):
     simulate(comm, folder, *COARSE, "eulerian.closure=smagorinsky", "eulerian.smagorinsky=500")
     attributes, _, columns = read(folder)
     assert all(np.isfinite(value) for value in attributes.values() if not isinstance(value, str))
-    assert "seconds_per_step" not in attributes and "too few steps to time one" in caplog.text
+    assert "seconds_per_step" not in attributes and "too few steps to time" in caplog.text
     assert attributes["status"].startswith("stopped: step") and "coarse flow is unstable" in attributes["status"]
     assert len(columns["model"]["velocity"]) >= 1
 

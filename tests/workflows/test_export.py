@@ -108,7 +108,7 @@ def test_a_run_without_tracers_has_its_last_field(comm, tmp_path):
 @pytest.mark.mpi(2)
 def test_a_run_with_nothing_to_export(comm, tmp_path):
     """All ranks raise, none waits, and no directory is made."""
-    for content, message in (("nothing", "holds no fields or particles"), ("no series", "holds no fields or particles"),
+    for content, message in (("nothing", "has no fields or particles"), ("no series", "has no fields or particles"),
                              ("unfinished", "ground_truth.h5: unfinished")):
         if comm.rank == 0 and content == "no series":
             with create_product(MPI.COMM_SELF, tmp_path / "ground_truth.h5", "ground_truth", {}):

@@ -160,7 +160,7 @@ def test_what_fits_is_kept_and_what_changed_is_redone(comm, run_directory, capfd
     assert run_cli(*changed, "--overwrite") == 0
     comm.Barrier()
     log = capfd.readouterr().out
-    assert comm.rank > 0 or log.count("skipped") == 3 and "rollout: complete" in log
+    assert comm.rank > 0 or log.count("skipped") == 3 and "; complete\n" in log
     assert [path.name for path, time in before.items() if path.stat().st_mtime_ns != time] == ["rollout.h5"]
 
 

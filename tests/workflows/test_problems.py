@@ -37,7 +37,7 @@ def test_built_in_scenes_have_no_problem_but_missing_runs(comm, name):
     refused, warnings = problems_of(load_scene(name), comm)
     others = [line for line in warnings if "of memory here" not in line and "of disk" not in line]
     if name == "cbc":  # its truth is an experiment
-        others = [line for line in others if "compared with nothing" not in line]
+        others = [line for line in others if "cannot be compared" not in line]
     assert all("no such file" in line for line in refused) and all("path" in line or "train" in line for line in others)
 
 
@@ -53,7 +53,7 @@ def test_built_in_scenes_have_no_problem_but_missing_runs(comm, name):
     ("time.courant=2.5", "[time] courant = 2.5: is unstable by advection", None),
     ("tracers.filter_width=2", "passes wavenumbers up to 1.6", "tracers.filter_width={lower it to}"),
     ("tracers.filter_width=0.1", "narrower than a cell", "tracers.filter_width={raise it to}"),
-    ("simulation.turnovers=5", "ends 0.3 turnovers after its start", "simulation.turnovers={lower it to}"),
+    ("simulation.turnovers=5", "ends 0.3 turnovers after the start", "simulation.turnovers={lower it to}"),
     ("simulation.turnovers=5", "[simulation] turnovers = 5", "tracers.turnovers={raise .tracers. turnovers to}"),
     ("simulation.start=0.9", "[simulation] turnovers = 0.3: the ground truth ends 0.06 turnovers", None),
 ])
@@ -99,7 +99,7 @@ def test_steps_that_are_too_long_for_a_forced_rollout_or_for_a_term(comm, warned
     for integrator, step, expected in (("verlet", 0.05, True), ("rk3", 0.04, False)):
         given = [*changes, f"simulation.integrator={integrator}", f"simulation.step={step}"]
         lines = problems_of(one_model("hit", given), comm)[1]
-        assert any("relaxes so fast" in line for line in lines) is expected
+        assert any("noise of the particles so fast" in line for line in lines) is expected
     sound = ["model.preset=wcsph", "training.horizons.steps=5", "model.wcsph.speed=0.8"]
     line, = (line for line in warned(*sound) if "sound" in line)
     scene = load_scene(TINY, sound)
@@ -122,7 +122,7 @@ def test_terms_and_weights_that_nothing_trains(warned, tmp_path):
 def test_a_warning_names_the_variants_that_it_concerns(comm):
     scene = load_scene("tiny", ["variant.paper.simulation.step=0.3", "variant.no-force.simulation.step=0.3",
                                 "simulation.injection=dissipation", "simulation.frame_interval=0.3"])
-    assert [line.partition(":")[0] for line in problems_of(scene, comm)[1] if "0.3: the particles" in line] == [
+    assert [line.partition(":")[0] for line in problems_of(scene, comm)[1] if "0.3: is too long" in line] == [
         "variant paper"]
     line, = (line for line in problems_of(load_scene("tiny", ["simulation.turnovers=5"]), comm)[1])
     assert line.startswith("variant paper, resolved, local, grid-16, grid-20, no-force: [simulation] turnovers = 5")
@@ -215,8 +215,8 @@ def test_files_that_do_not_fit(comm, tmp_path):
     (line,), _ = problems_of(load_scene("taylor-green", ["initial.kind=file", f"initial.path={path}/start.h5"]), comm)
     assert f"{path}/start.h5" in line
     start = ["initial.kind=file", f"initial.path={path}/start.h5", "realisations=[7]"]
-    lines, _ = problems_of(load_scene(TINY, start, ["initial.peak_wavenumber"]), comm)
-    assert [f"{path}/{name}start.h5" in line for name, line in zip(("", "realisation-7/"), lines, strict=True)] == [True] * 2
+    own, other = problems_of(load_scene(TINY, start, ["initial.peak_wavenumber"]), comm)[0]
+    assert f"{path}/start.h5" in own and f"{path}/realisation-7/start.h5" in other
     if comm.rank == 0:
         (tmp_path / "model.h5").write_text("nothing")
     comm.Barrier()
@@ -277,7 +277,7 @@ def test_a_ground_truth_with_too_few_frames_or_without_motion(comm, tmp_path):
     scene = load_scene(TINY, ["tracers.field_every=5"])
     write_ground_truth(comm, tmp_path, frames=30)
     check_ground_truth(["train", "simulate"], scene, comm, tmp_path)
-    with pytest.raises(SceneError, match="from frame 14 of 30 on, no filtered field is followed"):
+    with pytest.raises(SceneError, match="from frame 14 of 30 on, no frame has a filtered field"):
         coarse = dataclasses.replace(scene.simulation, frame_interval=0.5)
         check_ground_truth(["simulate"], dataclasses.replace(scene, simulation=coarse), comm, tmp_path)
     for group, value, stages, message in (("eddy_turnover_time", 1e12, ["simulate"], "3.8e.12 steps of 0.08"),

@@ -23,7 +23,7 @@ def test_products_that_belong_together_need_no_warning():
 def test_another_ground_truth_is_named_for_all_that_came_from_the_first():
     other = {**TRUTH, "id": "t2", "date": "2030-02-01", "scene": "seed = 2\n[flow]\ncells = 64"}
     model, rollout = mixed_products({"ground_truth": other, "model": MODEL, "rollout": ROLLOUT})
-    assert model.startswith("model.h5 (made 2030-01-02)") and "remove it and run `eddies train` again" in model
+    assert model.startswith("model.h5 (made 2030-01-02)") and "remove model.h5 and run `eddies train` again" in model
     for words in ("rollout.h5 (made 2030-01-03) was made from another ground_truth.h5", "made 2030-02-01",
                   "seed = 1, now 2", "flow.cells = 48, now 64", "`eddies simulate`"):
         assert words in rollout
@@ -43,7 +43,7 @@ def test_a_truth_of_another_run_that_has_changed_is_named(comm, tmp_path):
     known = product_provenance(path)["id"]
     for truths, number in (({path: known}, 0), ({path: "t9"}, 1), ({str(tmp_path / "gone.h5"): "t9"}, 0)):
         found = changed_truths({**MODEL, "truths": truths})
-        assert len(found) == number and all(f"was trained on a {path} that has since changed" in each for each in found)
+        assert len(found) == number and all(f"was trained on {path}, which has changed" in each for each in found)
 
 
 def warning_of(comm, directory, kind, **holes):
@@ -73,7 +73,7 @@ def test_numbers_that_are_not_finite_are_placed(comm, tmp_path):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("status, remedy", [("complete", "remove it and run `eddies simulate` again"),
+@pytest.mark.parametrize("status, remedy", [("complete", "remove rollout.h5 and run `eddies simulate`"),
                                             ("stopped: particle 17 is too fast", "the rollout stopped: particle 17")])
 def test_a_rollout_that_was_stopped_gives_the_reason(comm, tmp_path, status, remedy):
     write_rollout(comm, tmp_path, status=status, broken=8)

@@ -67,7 +67,7 @@ def test_scenes_without_a_model_are_measured(measured, name):
 
 @pytest.mark.mpi(1, 2)
 def test_a_signal_ends_it_with_nothing_left(measured):
-    with pytest.raises(Stopped, match="SIGTERM; the same command continues from the beginning"):
+    with pytest.raises(Stopped, match="SIGTERM; the same command starts again from the beginning"):
         measured(TINY, signals=[signal.SIGTERM])
 
 

@@ -140,7 +140,7 @@ sound_speed = 15.0
     (SECTION.replace("20.0", "19.0"), ProductError, "outside the box from .* to .19"),
     (SECTION.replace("box = 20.0", ""), SceneError, "box: this key is missing"),
     (SECTION + "sound_speed = 5.0", SceneError, "has no densities"),
-    (SECTION.replace("true", "false") + "[kernel]\nsteps = 1", SceneError, "filtered = false: models are those of"),
+    (SECTION.replace("true", "false") + "[kernel]\nsteps = 1", SceneError, "filtered = false: models need a filtered"),
     (SECTION + "[forcing]\ninjection_rate = 1", SceneError, "takes the place of this section"),
     ("realisations = [1]\n" + SECTION, SceneError, "the file has one realisation"),
     (SECTION + '[reconstruction]\nmethod = "memory"', SceneError, "viscosity: .* the method memory"),

@@ -13,11 +13,12 @@ from eddies.measures import MEASURES
 
 
 def accuracy(run: Rollout) -> dict[str, float | None]:
-    """All MEASURES, and `end`, the last common time over T; None for a time that rollout or truth does not reach.
+    """All MEASURES, and `end`, the last common time over T. A measure at a time that rollout or truth does not reach
+    is None.
 
     Velocity errors are normalised L2 norms by particle, interpolated linearly between frames. Measures at the end are
-    taken at the last common frame, Lagrangian statistics over all common frames. A rollout that is not complete has
-    neither: it ends earlier than others.
+    taken at the last common frame, Lagrangian statistics over all common frames. Both are None for a rollout that is
+    not complete, because it ends earlier than others.
     """
     measures: dict[str, float | None] = dict.fromkeys(MEASURES)
     try:

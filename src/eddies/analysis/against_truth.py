@@ -20,7 +20,7 @@ def mean_energy(frames: Frames, frame: int) -> float:
 
 
 def particle_series(frames: Frames, chosen: Sequence[int]) -> dict[str, np.ndarray]:
-    """Columns over chosen frames: time, energy <v.v>/2, and density_rms where a density is stored."""
+    """Columns over chosen frames: time, energy <v.v>/2, and density_rms if a density is stored."""
     columns = {"time": frames.times[np.asarray(chosen)],
                "energy": np.array([mean_energy(frames, frame) for frame in chosen])}
     if "density" in frames.columns:
@@ -44,13 +44,13 @@ def error_series(run: Rollout) -> dict[str, np.ndarray]:
 
 
 def pdf_divergence(pair: Pair, edges: np.ndarray) -> float:
-    """Forward KL divergence of the PDFs of all components, both standardised by the truth."""
+    """Forward KL divergence of the PDFs of all components, both standardised by mean and deviation of the truth."""
     return kl_divergence(bin_probabilities(standardized(pair.truth), edges),
                          bin_probabilities(standardized(pair.model, pair.truth), edges))
 
 
 def sampling_floor(pair: Pair, edges: np.ndarray) -> float:
-    """The divergence of the same PDF between two independent samples of the truth.
+    """Expected divergence of this PDF between two independent samples of the truth.
 
     A model whose particles are still near the true ones can be below it.
     """
@@ -60,7 +60,7 @@ def sampling_floor(pair: Pair, edges: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class InvariantStatistics:
-    """Q-R statistics at one time: cell probabilities of both runs, and the sampling floor of their divergence."""
+    """Q-R statistics at one time: bin probabilities of model and truth, and the sampling floor of their divergence."""
 
     bins: InvariantBins
     model: np.ndarray
@@ -90,7 +90,7 @@ def last_invariants(run: Rollout) -> InvariantStatistics:
 def conditional_flows(run: Rollout, bins: InvariantBins) -> tuple[ConditionalVelocity, ConditionalVelocity] | None:
     """Conditional mean (dQ/dt, dR/dt) of model and truth over all common frames; None with fewer than two frames.
 
-    Units are the truth's <Q_w> at the time.
+    Q, R and their rates are in units of the truth's <Q_w> at the time.
     """
     times = run.common.times
     if times.size < 2:

@@ -2,7 +2,7 @@
 
 Successive frames are not independent: the large eddies, which hold the energy, change in about a turnover. Means of
 blocks of at least a turnover are nearly independent, so that their scatter gives the error of the mean. The energy of
-forced flows swings over several turnovers; then even these errors are too small.
+forced flows varies over several turnovers, so for them even these errors are too small.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,7 +33,7 @@ class Blocks:
 
     @classmethod
     def of(cls, times: np.ndarray, shortest: float) -> "Blocks":
-        """The largest number of blocks that are at least `shortest` long, or one block; empty blocks are left out."""
+        """As many equal blocks as possible that are at least `shortest` long, or one. Empty blocks are left out."""
         span = float(times[-1] - times[0])
         count = max(min(int(span / shortest + 1e-9), len(times)), 1)
         block = ((times - times[0]) * (count / max(span, 1e-300)) + 1e-9).astype(int).clip(max=count - 1)
@@ -58,7 +58,7 @@ class Blocks:
         return Estimate(value, float(np.sqrt((count - 1) * np.var(without))))
 
     def trend(self, samples: np.ndarray) -> Estimate:
-        """Slope of the regression line of samples (n,); its error, from the blocks' residuals, needs three blocks."""
+        """Slope of the regression line of samples (n,) over time. The error, from block residuals, needs 3 blocks."""
         offsets, deviations = self.times - self.times.mean(), samples - samples.mean()
         slope = float(np.sum(offsets * deviations) / np.sum(offsets**2)) if offsets.any() else np.nan
         times, residuals = self.means(offsets), self.means(deviations - slope * offsets)

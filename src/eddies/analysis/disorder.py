@@ -14,7 +14,7 @@ from eddies.analysis.rollout import Frames, Rollout
 # Bins of the PDF of nearest-neighbour distances, in mean spacings; a share exp(-14) of random points lies beyond.
 DISTANCE_EDGES = np.linspace(0, 1.5, 31)
 SAMPLED = 2**15  # largest number of particles whose nearest neighbour is searched
-PAIRS = 2**22  # about the largest number of pairs that are listed at once, where particles have gathered
+PAIRS = 2**22  # about the largest number of pairs in a list, if particles have gathered
 CELL = 2.0  # side of the cells in which particles are counted, in mean spacings: about a filter width
 
 
@@ -25,7 +25,7 @@ def mean_spacing(total: int, length: float) -> float:
 def nearest_distances(position: np.ndarray, length: float) -> np.ndarray:
     """Distance to the nearest other particle for at most SAMPLED particles, evenly chosen by row: (n, 3) -> (m,).
 
-    Distances are periodic with `length`. Infinite for a particle that is alone.
+    Distances are periodic with `length`. Infinite for a single particle.
     """
     radius = mean_spacing(len(position), length) / 2
     crowd = _counts(position, length, round(length / (2 * radius))).max()
@@ -53,8 +53,8 @@ def random_distance_density(distance: np.ndarray) -> np.ndarray:
 def count_variance(position: np.ndarray, length: float) -> float:
     """Variance of the counts of particles (n, 3) in cells of side CELL mean spacings, divided by that of random points.
 
-    Counts of random points are multinomial: their variance is the mean times 1 - 1/cells. So 0 is a lattice, 1 random
-    within sqrt(2 / cells), and more than 1 clustered. NaN for fewer than two cells a side.
+    Counts of random points are multinomial: their variance is the mean times 1 - 1/cells. So 0 means a lattice, 1
+    (to within sqrt(2 / cells)) random points, and more than 1 clusters. NaN for fewer than two cells along a side.
     """
     side = round(len(position) ** (1 / 3) / CELL)
     if side < 2:
@@ -92,7 +92,7 @@ def mean_drift(start: np.ndarray, end: np.ndarray) -> float:
 
 
 def drifts(run: Rollout) -> dict[str, dict[str, float]]:
-    """Drifts from the first to the last common time, by name, each of "model" and "truth".
+    """Drifts from the first to the last common time, by name, for "model" and "truth".
 
     They are `momentum_drift`, `count_variance` at the last time and, for a model that integrates a density,
     `density_drift`.

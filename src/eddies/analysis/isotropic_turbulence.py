@@ -1,4 +1,4 @@
-"""Averages of stationary isotropic turbulence, and the values of the literature at the same Reynolds number.
+"""Averages of stationary isotropic turbulence, and values from the literature at the same Reynolds number.
 
 u' is the rms of a velocity component, L the integral scale, eps the dissipation rate, eta Kolmogorov's length.
 """
@@ -13,7 +13,7 @@ from eddies.analysis.block_averages import Blocks, Estimate
 
 # Sreenivasan, Phys. Fluids 7, 2778 (1995); Yeung & Zhou, Phys. Rev. E 56, 1746 (1997).
 KOLMOGOROV_CONSTANT = (1.5, 1.64)
-INERTIAL = (0.03, 0.2)  # of k eta, where spectra are compared with Kolmogorov's constant
+INERTIAL = (0.03, 0.2)  # range of k eta in which spectra are compared with Kolmogorov's constant
 BOTTLENECK = 0.5  # largest k eta at which the maximum of a compensated spectrum is searched
 COMPONENTS = ("energy_x", "energy_y", "energy_z")
 
@@ -64,7 +64,7 @@ class Row:
     """A quantity of this flow and its value in the literature.
 
     `deviation` is its standard deviation in time, None if it is not an average. `error` is its standard error, None if
-    the average is over less than two turnovers.
+    the average is over fewer than two turnovers.
     """
 
     key: str
@@ -95,11 +95,11 @@ class StationarySpan:
         time, tolerance = statistics["time"], 1e-9 * max(1.0, abs(end))
         inside = (time >= start - tolerance) & (time <= end + tolerance)
         if inside.sum() < 3:
-            raise ValueError(f"only {inside.sum()} samples from t = {start:g} to {end:g}: nothing to average")
+            raise ValueError(f"only {inside.sum()} samples from t = {start:g} to {end:g}: at least 3 are needed")
         self.columns = {name: values[inside] for name, values in statistics.items()}
         self.viscosity, self.forced_below = viscosity, forced_below
         interval = np.diff(self.columns["time"])
-        # Trapezoidal rule: steps, and so the intervals between samples, vary.
+        # Trapezoidal rule: time steps vary, and so do the intervals between samples.
         self._weights = (np.append(interval, 0) + np.append(0, interval)) / (2 * interval.sum())
         self.spectra = spectra[inside]
         self.spectrum = self._weights @ self.spectra
@@ -126,7 +126,7 @@ class StationarySpan:
 
     @property
     def energy_trend(self) -> Estimate:
-        """Slope of the regression line of the energy over its mean, per turnover."""
+        """Relative trend of the energy: slope of the regression line of energy / mean energy, per turnover."""
         return self._blocks.trend(self.columns["energy"] / self.mean("energy"))
 
     @cached_property
@@ -166,8 +166,8 @@ class StationarySpan:
         """Skewness S of the longitudinal gradient from the enstrophy budget of an isotropic flow, (samples,).
 
         -S (35/2) (W/15)^(3/2) = nu <|grad w|^2> + 1/2 dW/dt with the enstrophy W = <w.w> = eps/nu and
-        <|grad w|^2> = 2 sum k^4 E(k) (Batchelor & Townsend, Proc. R. Soc. A 190, 534, 1947). The enstrophy from the
-        forcing is neglected: 1 % at Re_lambda = 85, 8 % at 25.
+        <|grad w|^2> = 2 sum k^4 E(k) (Batchelor & Townsend, Proc. R. Soc. A 190, 534, 1947). The enstrophy that
+        the forcing injects is neglected: 1 % at Re_lambda = 85, 8 % at 25.
         """
         enstrophy = self.columns["dissipation_rate"] / self.viscosity
         destroyed = 2 * self.viscosity * self.spectra @ np.arange(self.spectra.shape[1]) ** 4.0
@@ -191,12 +191,12 @@ def comparison(span: StationarySpan) -> list[Row]:
     dissipation = c["dissipation_rate"] * c["integral_scale"] / c["velocity_rms"] ** 3
     gradients = "Ishihara et al. 2007, fit at Re_λ > 200"
     rows = [
-        Row("turnovers", "large-eddy turnovers averaged over", span.turnovers),
+        Row("turnovers", "large-eddy turnovers in the average", span.turnovers),
         averaged("reynolds_lambda", "Re_λ", c["reynolds_lambda"]),
         averaged("kmax_eta", "k_max η", c["kmax_eta"], "1 or more", "Eswaran & Pope 1988"),
         averaged("skewness", "skewness of the longitudinal gradient", c["skewness"],
                  gradient_skewness(reynolds), gradients),
-        averaged("enstrophy_skewness", "the same from the production of enstrophy, were the flow isotropic",
+        averaged("enstrophy_skewness", "the same from the enstrophy budget of an isotropic flow",
                  span.enstrophy_skewness(), gradient_skewness(reynolds), gradients),
         averaged("flatness", "flatness of the longitudinal gradient", c["flatness"],
                  gradient_flatness(reynolds), gradients),
@@ -216,10 +216,10 @@ def comparison(span: StationarySpan) -> list[Row]:
 
 
 def _spectrum_rows(span: StationarySpan) -> list[Row]:
-    """Mean and maximum of the compensated spectrum, if the flow has shells in their ranges."""
+    """Rows of the mean and the maximum of the compensated spectrum, if the flow has shells in their ranges."""
     k_eta, compensated = span.unforced()
     inertial = compensated[(k_eta >= INERTIAL[0]) & (k_eta <= INERTIAL[1])]
-    constant = "{}–{}, a bottleneck above".format(*KOLMOGOROV_CONSTANT)
+    constant = "{}–{}, more in a bottleneck".format(*KOLMOGOROV_CONSTANT)
     sources = "Sreenivasan 1995, Yeung & Zhou 1997"
     rows = []
     if inertial.size:
@@ -235,7 +235,7 @@ def _spectrum_rows(span: StationarySpan) -> list[Row]:
 
 
 def _compressibility_rows(span: StationarySpan) -> list[Row]:
-    """M_t, and quantities that scale with a power of a small M_t.
+    """Rows of M_t and of quantities that scale with a power of M_t if M_t is small.
 
     The density follows the pressure of the incompressible flow, rho' = p / c^2, so that rho_rms ~ M_t^2. The
     compressible velocity is ~ M_t^2 u' (pseudo-sound: Ristorcelli, J. Fluid Mech. 347, 37, 1997).

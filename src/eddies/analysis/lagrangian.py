@@ -13,7 +13,7 @@ from eddies.analysis.rollout import CommonFrames, Frames
 from eddies.kernels.library import library
 from eddies.kernels.neighbors import Box, neighbors_within
 
-VALUES = 2**22  # numbers of a column of vectors that are held at once, over all frames
+VALUES = 2**22  # about the largest number of values of a column in memory at once, over all frames
 LAGS = 18       # largest number of lags
 TETRADS = 1000  # particles around which pairs and tetrads are followed
 CORNERS = 4
@@ -25,9 +25,9 @@ class PathStatistics:
 
     Parameters
     ----------
-    times : of the frames, (m,). lags : times, (l,).
+    times : of the frames, (m,). lags : in units of time, (l,).
     structure, flatness : <dv^2> and <dv^4>/<dv^2>^2 of the increments dv of a velocity component over a lag, (l,).
-    velocity_correlation : with the first frame, (m,).
+    velocity_correlation : with the velocities in the first frame, (m,).
     acceleration_correlation : over the lags, (l,). acceleration_variance : of a component, (m,).
     pair_dispersion : <|r(t) - r(0)|^2> / <r(0)^2> of nearest neighbours, (m,).
     tetrad_size : <R^2> over its value at the start, of a particle and its three nearest neighbours: R^2 is the sum of
@@ -50,7 +50,7 @@ class PathStatistics:
 
 def of_both(model: Frames, truth: Frames, common: CommonFrames,
             length: float) -> tuple[PathStatistics, PathStatistics]:
-    """Statistics of model and truth over all common frames; tetrads are found in the truth at the first one."""
+    """Statistics of model and truth over all common frames; tetrads are those of the truth in the first one."""
     tetrads = near_tetrads(truth.read(int(common.truth[0]), "position"), length)
     return (path_statistics(model, common.model, tetrads, length),
             path_statistics(truth, common.truth, tetrads, length))
@@ -62,7 +62,7 @@ def evenly(total: int, most: int) -> np.ndarray:
 
 
 def lags_of(longest: int) -> np.ndarray:
-    """At most LAGS lags from 1 to `longest` in frames, about evenly spread in the logarithm."""
+    """At most LAGS lags in frames, from 1 to `longest`, about evenly spread in the logarithm."""
     return np.unique(np.rint(np.geomspace(1, longest, LAGS)).astype(int)) if longest else np.empty(0, int)
 
 
@@ -73,7 +73,7 @@ def near_tetrads(position: np.ndarray, length: float) -> np.ndarray:
 
 
 def path_statistics(run: Frames, chosen: Sequence[int], tetrads: np.ndarray, length: float) -> PathStatistics:
-    """Measure the chosen frames of a run, whose tetrads are rows (4, g) of its particles."""
+    """Statistics of the chosen frames of a run; `tetrads` are rows (4, g) of its particles."""
     chosen = [int(frame) for frame in chosen]
     times = run.times[chosen] - run.times[chosen[0]]
     velocity, acceleration = (_sample(run, chosen, column) for column in ("velocity", "acceleration"))
@@ -89,8 +89,8 @@ def path_statistics(run: Frames, chosen: Sequence[int], tetrads: np.ndarray, len
 def differences(model: PathStatistics, truth: PathStatistics) -> dict[str, float]:
     """Errors of the model by name: rms of ln(model / truth) over lags or times.
 
-    Dispersion and tetrads leave out the first time, at which both are equal. The correlation of accelerations, which
-    changes sign, has the rms of the difference.
+    Dispersion and tetrads leave out the first time, at which both are equal. The error of the correlation of
+    accelerations, which changes sign, is the rms of the difference.
     """
     def log_ratio(name: str, first: int = 0) -> float:
         return rms_log_ratio(getattr(model, name)[first:], getattr(truth, name)[first:])
@@ -130,7 +130,7 @@ def _dispersion(run: Frames, chosen: Sequence[int], tetrads: np.ndarray,
 
 
 def tetrad_moments(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """R^2 (g,) and the eigenvalues of the moments over R^2 (g, 3), the largest first, of tetrads (4, g, 3)."""
+    """Size R^2 (g,) of tetrads (4, g, 3), and shape (g, 3): eigenvalues of second moments over R^2, largest first."""
     offsets = corners - corners.mean(axis=0)
     eigenvalues = np.linalg.eigvalsh(np.einsum("cgi,cgj->gij", offsets, offsets))[:, ::-1]
     size = eigenvalues.sum(axis=1)
@@ -152,7 +152,7 @@ def structure_function(velocity: Sequence[np.ndarray], lags: np.ndarray) -> np.n
 
 
 def increment_flatness(velocity: Sequence[np.ndarray], lags: np.ndarray) -> np.ndarray:
-    """Flatness <dv^4> / <dv^2>^2 of the increments of a velocity component over lags, (m,): 3 if they are normal.
+    """Flatness <dv^4> / <dv^2>^2 of the increments of a velocity component over lags, (m,); 3 if Gaussian.
 
     Arguments as for `structure_function`. The flatness is averaged over start frames, so that the decay of a flow does
     not widen the tails. NaN for a constant velocity.
@@ -206,7 +206,7 @@ def near(position: np.ndarray, length: float, chosen: np.ndarray,
          radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The other rows of positions (n, 3) within a radius of each of the chosen rows (m,), periodic with `length`.
 
-    Returns the place in `chosen`, the other row and the distance of each such pair. Places rise.
+    Returns for each pair the place in `chosen`, the other row and the distance. Places are in ascending order.
     """
     offsets, rows = neighbors_within(library(), Box(length, True), radius, position[chosen], position, False)
     places = np.repeat(np.arange(chosen.size), np.diff(offsets))
@@ -230,9 +230,9 @@ def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], to
 
 
 def nearest_rows(position: np.ndarray, length: float, chosen: np.ndarray, count: int) -> np.ndarray:
-    """Rows (count, m) of the nearest other particles of each chosen row (m,) of positions (n, 3), nearest first.
+    """Rows (count, m) of the other particles nearest to each chosen row (m,) of positions (n, 3), nearest first.
 
-    Raises ValueError with fewer other particles than `count`.
+    Raises ValueError if there are fewer other particles than `count`.
     """
     if len(position) <= count:
         raise ValueError(f"{len(position)} particles: at least {count + 1} are needed")

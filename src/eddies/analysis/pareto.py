@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-Method = Mapping[str, Any]  # `label`, a cost and errors by key, None where unknown; KEY_spread: standard deviations
+Method = Mapping[str, Any]  # `label`, a cost and errors by key (None: unknown), and KEY_spread: standard deviations
 
 
 def pareto_front(cost: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Indices of the points (n,) that no other one dominates, from the cheapest on; points with NaN are left out.
+    """Indices of the points (n,) that no other one dominates, in order of cost; points with NaN are left out.
 
     A point dominates another if neither its cost nor its error is larger and one of them is smaller.
     """
@@ -29,8 +29,8 @@ def verdict(model: Method, others: Sequence[Method], cost: str, measures: Mappin
     """Two texts: the measures in which a method is worth its cost, and the rivals in the other measures.
 
     A rival is another method that costs no more and is as accurate. A method is worth its cost if it has no rival.
-    Errors that differ by less than the larger spread over realisations are equal. A method without a number is no
-    rival. Each measure names only the cheapest rival and the number of the others. The errors are in the table.
+    Errors that differ by less than the larger spread over realisations are equal. A method without a number is not
+    a rival. For each measure, the text names the cheapest rival and the number of the others.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def verdict(model: Method, others: Sequence[Method], cost: str, measures: Mappin
             beaten.append(f"{short}: {rivals[0]['label']}" + (f" and {len(rivals) - 1} more" if rivals[1:] else ""))
         else:
             worth.append(short)
-    found = [f"As accurate and no slower, the cheapest named: {'; '.join(beaten)}."] if beaten else []
+    found = [f"As accurate and no slower (only the cheapest is named): {'; '.join(beaten)}."] if beaten else []
     found += [f"{name} has no number for {'; '.join(unknown)}."] if unknown else []
     return [f"{name} is worth its cost in {'; '.join(worth)}." if worth else f"{name} is worth its cost in no measure.",
             " ".join(found) or "No other method is as accurate and no slower in any measure."]
@@ -74,7 +74,7 @@ def cheapest_grid(model: Method, grids: Sequence[Method], cost: str, times: Mapp
 
 
 def break_even(first: float, each: float, rival_first: float, rival_each: float) -> float:
-    """Turnovers after which a method has taken less time than a rival; infinite if its turnovers take as long.
+    """Turnovers after which a method has taken less time than a rival; infinite if its turnovers are not faster.
 
     `first` are the seconds before the first turnover, `each` those of a turnover.
     """
@@ -84,6 +84,6 @@ def break_even(first: float, each: float, rival_first: float, rival_each: float)
 
 
 def _worse(row: Method, model: Method, key: str) -> bool:
-    """Whether the error of a row is larger, by more than either spread."""
+    """Whether the error of a row is larger than the model's by more than both spreads."""
     spread = max(one.get(f"{key}_spread") or 0.0 for one in (row, model))
     return row[key] > model[key] + spread

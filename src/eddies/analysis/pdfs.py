@@ -19,7 +19,7 @@ def bin_probabilities(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """
     values = np.asarray(values, dtype=float).ravel()
     if values.size == 0 or not np.isfinite(values).all():
-        raise ValueError("a PDF needs at least one value, and finite ones only")
+        raise ValueError("a PDF needs at least one value, and all values must be finite")
     counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
     return counts / values.size
 
@@ -44,7 +44,7 @@ def kl_divergence(truth: np.ndarray, prediction: np.ndarray) -> float:
 def sampling_divergence(rows: int, probabilities: Callable[[np.ndarray], np.ndarray]) -> float:
     """Expected divergence between two independent samples of `rows` rows: the value of a perfect model.
 
-    It is half the divergence between two random halves of the sample, as it falls with 1 / rows. `probabilities`
+    It is half the divergence between two random halves of the sample, because it decreases as 1 / rows. `probabilities`
     returns the bin probabilities of chosen rows.
     """
     shuffled = np.random.default_rng(0).permutation(rows)

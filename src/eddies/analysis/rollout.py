@@ -24,7 +24,7 @@ class Frames(Protocol):
     length: float
 
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Rows start to stop of one column of one frame, in order of id."""
+        """Rows start, ..., stop - 1 of one column of one frame, in order of id."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class CommonFrames:
 
     @classmethod
     def of(cls, model: Frames, truth: Frames, until: float = np.inf) -> "CommonFrames":
-        """Pair the frames before `until` whose times agree to 1e-6. Raises ValueError without such frames."""
+        """Pair the frames before `until` whose times agree to 1e-6. Raises ValueError if there are none."""
         gap = np.abs(model.times[:, None] - truth.times[None, :])
         same = gap <= 1e-6 * max(1.0, np.ptp(model.times))
         rows, columns = np.nonzero(same & (model.times < until)[:, None])
@@ -104,16 +104,16 @@ class Rollout:
     ----------
     attributes : of the group `rollout` of the product.
     model, truth : particles, at times since the start of the rollout. The truth may end earlier. Without a ground truth
-        it has no frame; `without_truth` is the reason.
+        it has no frames, and `without_truth` gives the reason.
     length : edge of the box.
     flow : table `spectra` of the ground truth, with `energy` and `filtered`. Its times and `start_time` count from the
         release of the tracers.
     reference : scales of the ground truth.
-    spectra : energy (shells,) by frame, of "model" and "truth": least squares for the modes of the particles' velocity.
+    spectra : energy (shells,) by frame, of "model" and "truth", from a least-squares fit of modes to the velocities.
     invariants, planes : of the reconstructed velocity gradient at the particles, and of the reconstructed field; by
         frame, of "model" and "truth". None without a kernel.
-    outside_training : share of the pairs outside the training range, (frames,), where it was counted.
-    closure : columns over the frames on the solves for the resolved velocity, where there were any.
+    outside_training : share of the pairs outside the training range, (frames,); None if it was not counted.
+    closure : columns (frames,) about the solves for the resolved velocity; None if there were none.
     reconstructed_by : the form of the reconstructions in words.
     """
 
@@ -157,18 +157,18 @@ class Rollout:
 
     @property
     def powers(self) -> tuple[float, float]:
-        """Power per mass of the forcing of the model, and of the true flow."""
+        """Power per mass of the forcing: in the model, and in the true flow."""
         model, truth = (float(self.attributes.get(name, 0.0)) for name in ("injection_rate", "truth_injection_rate"))
         return model, truth
 
     @property
     def status(self) -> str:
-        """The end of the rollout: "complete", or "stopped: reason"."""
+        """How the rollout ended: "complete", or "stopped: reason"."""
         return str(self.attributes["status"])
 
     @cached_property
     def broken(self) -> float:
-        """Time of the first frame with a velocity or acceleration that is not finite; infinity without one."""
+        """Time of the first frame with a velocity or acceleration that is not finite; infinity if there is none."""
         for frame, time in enumerate(self.model.times):
             if not all(np.isfinite(self.model.read(frame, column)).all() for column in ("velocity", "acceleration")):
                 return float(time)
@@ -176,7 +176,7 @@ class Rollout:
 
     @cached_property
     def common(self) -> CommonFrames:
-        """The common frames before the model broke. Raises ValueError, with the reason, without such frames."""
+        """The common frames before the model broke. Raises ValueError, with the reason, if there are none."""
         if not len(self.truth.times) and self.without_truth:
             raise ValueError(self.without_truth)
         return CommonFrames.of(self.model, self.truth, self.broken)
@@ -192,7 +192,7 @@ class Rollout:
                     self.truth.read(int(common.truth[index]), column))
 
     def both(self, measures: Mapping[str, Mapping[int, Any]], index: int) -> tuple[Any, Any]:
-        """Values of model and truth at a common frame, of `invariants`, `planes` or `spectra`."""
+        """Values of `measures`, such as `invariants` or `spectra`, of model and truth at a common frame."""
         return measures["model"][int(self.common.model[index])], measures["truth"][int(self.common.truth[index])]
 
     @property
@@ -206,14 +206,14 @@ class Rollout:
         return np.flatnonzero(self._has_flow(self.common.times))
 
     def shown_spectra(self, several: bool = True) -> np.ndarray:
-        """A few frames of `spectral`, evenly spread, or only the last."""
+        """A few frames of `spectral`, evenly spread; only the last one unless `several`."""
         return _spread(self.spectral(), SHOWN) if several else self.spectral()[-1:]
 
     def late_spectra(self) -> np.ndarray:
         """Frames of the model over which its spectrum is averaged, in the second half before it broke.
 
-        The flow's spectrum is stored at their times, or they are after the end of the truth. If the second half has no
-        such frame, the last such frame before it is used.
+        Either the spectrum of the flow is stored at the time of such a frame, or the truth has no frame at this time.
+        If the second half has no such frame, the last one before it is used.
         """
         times = self.model.times
         chosen = self._has_flow(times) | ~_contained(times, self.truth.times)
@@ -221,7 +221,7 @@ class Rollout:
         return frames[second_half(times[frames], float(times[self.before_broken("model")[-1]]))]
 
     def spectra_at(self, index: int) -> SpectraAt:
-        """Spectra at a common frame, in the shells that all of them have. That of the flow is at the nearest time."""
+        """Spectra at a common frame, in the shells that all have. That of the flow is from the nearest time."""
         common = self.common
         model, truth = self.both(self.spectra, index)
         nearest = int(np.argmin(np.abs(self.flow["time"] - (self.start_time + common.times[index]))))
@@ -245,5 +245,5 @@ def _spread(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def _contained(times: np.ndarray, among: np.ndarray) -> np.ndarray:
-    """Whether each of times (m,) is among others (l,), to 1e-6."""
+    """Whether each of `times` (m,) is equal, to 1e-6, to one of `among` (l,)."""
     return (np.abs(times[:, None] - among[None, :]) < 1e-6).any(axis=1)

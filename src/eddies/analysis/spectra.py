@@ -1,27 +1,8 @@
-"""Energy spectra and vorticity of real periodic fields on the cube [0, 2 pi)^3."""
+"""Errors of energy spectra, and the vorticity of real periodic fields on the cube [0, 2 pi)^3."""
 
 import numpy as np
 
 from eddies.analysis.errors import rms_log_ratio
-
-
-def energy_spectrum(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Energy by shells, E(k) = 1/2 sum |u_hat|^2 over k - 1/2 <= |k| < k + 1/2, of a velocity (3, n, n, n).
-
-    Returns wavenumber and energy, both (shells,), from k = 0 to the corner of the spectral cube: the sum of E(k) is
-    <u.u>/2 (Parseval). Raises ValueError if the field is not cubic.
-    """
-    kz, ky, kx = _wavenumbers(velocity)
-    cells = velocity.shape[-1]
-    shell = np.rint(np.sqrt(kz**2 + ky**2 + kx**2)).astype(np.int64).ravel()
-    mode_energy = np.zeros(shell.size)
-    for component in velocity:
-        mode_energy += 0.5 * np.abs(np.fft.rfftn(np.asarray(component, dtype=float)).ravel() / cells**3) ** 2
-    # The real transform holds one of each two conjugate modes, but both on the planes kx = 0 and kx = n / 2.
-    conjugates = np.where((kx == 0) | (2 * kx == cells), 1.0, 2.0)
-    mode_energy *= np.broadcast_to(conjugates, (cells, cells, kx.size)).ravel()
-    energy = np.bincount(shell, weights=mode_energy)
-    return np.arange(energy.size, dtype=float), energy
 
 
 def spectrum_error(energy: np.ndarray, reference: np.ndarray, largest_wavenumber: float) -> float:
@@ -55,16 +36,9 @@ def vorticity(velocity: np.ndarray) -> np.ndarray:
     Derivatives of the Nyquist modes are set to zero, as a real field requires.
     """
     cells = velocity.shape[-1]
-    kz, ky, kx = (1j * np.where(2 * np.abs(k) == cells, 0, k) for k in _wavenumbers(velocity))
+    k = np.fft.fftfreq(cells, 1 / cells)
+    k[2 * np.abs(k) == cells] = 0
+    kz, ky, kx = 1j * k[:, None, None], 1j * k[:, None], 1j * np.abs(k[:cells // 2 + 1])
     u, v, w = (np.fft.rfftn(np.asarray(component, dtype=float)) for component in velocity)
     curl = (ky * w - kz * v, kz * u - kx * w, kx * v - ky * u)
     return np.stack([np.fft.irfftn(component, s=(cells,) * 3, axes=(0, 1, 2)) for component in curl])
-
-
-def _wavenumbers(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """kz, ky and kx >= 0 of the modes of a field, broadcast over (kz, ky, kx)."""
-    if velocity.ndim != 4 or velocity.shape[0] != 3 or len(set(velocity.shape[1:])) != 1:
-        raise ValueError(f"a velocity field has shape (3, n, n, n), not {velocity.shape}")
-    cells = velocity.shape[-1]
-    full = np.fft.fftfreq(cells, 1 / cells)
-    return full[:, None, None], full[None, :, None], np.arange(cells // 2 + 1, dtype=float)[None, None, :]

@@ -12,7 +12,7 @@ from eddies.analysis.lagrangian import lags_of, pair_dispersion, pairs_at, struc
 from eddies.analysis.pdfs import bin_edges, pdf
 from eddies.analysis.rollout import Frames
 
-FOLLOWED = 2**14  # tracers whose velocities at all times are held at once
+FOLLOWED = 2**14  # largest number of tracers whose velocities at all times are in memory at once
 CENTRES = 1000  # tracers around which pairs are searched
 PAIRS, FEWEST = 10_000, 30  # largest and smallest number of pairs at a distance
 SEPARATIONS, TOLERANCE = (0.5, 1.0, 2.0, 4.0), 0.1  # initial distances of pairs in mean spacings; relative tolerance
@@ -36,11 +36,11 @@ class TracerStatistics:
     Parameters
     ----------
     energy_ratio : <v.v> of the tracers divided by <v.v> of the filtered field, at `field_times`, (fields,).
-    energy_error : standard deviation of this ratio for as many random points, (fields,).
+    energy_error : standard deviation of this ratio for the same number of random points, (fields,).
     probability : PDF (bins,) on EDGES of an acceleration component in units of its rms at the time, from differences of
         successive frames.
-    kurtosis : of the same, 3 if it is Gaussian.
-    acceleration_rms : over the first interval.
+    kurtosis : of this PDF; 3 if it is Gaussian.
+    acceleration_rms : of a component, over the first interval.
     structure : Lagrangian structure function at the times `lags`.
     """
 
@@ -57,24 +57,24 @@ class TracerStatistics:
 
     @property
     def structure_exponent(self) -> float:
-        """First exponent of the structure function over the lag: 2 if accelerations are resolved."""
+        """Exponent of the structure function between the first two lags: 2 if accelerations are resolved."""
         return first_exponent(self.lags, self.structure)
 
     @property
     def ballistic_exponent(self) -> float:
-        """First exponent of the pair dispersion over time, mean over the distances: 2 while velocities last."""
+        """Exponent of the pair dispersion at the first two times after the start, mean over distances; ballistic: 2."""
         exponents = [first_exponent(self.times[1:], pairs.spread[1:]) for pairs in self.dispersion]
         return float(np.mean(exponents)) if exponents else np.nan
 
     @property
     def ballistic_prefactor(self) -> float:
-        """<|r - r0|^2> / (<|v_1 - v_2|^2> t^2) at the first frame after the start, mean over the distances: 1."""
+        """<|r - r0|^2> / (<|v_1 - v_2|^2> t^2) at the first time after the start, mean over distances; ballistic: 1."""
         ratios = [pairs.spread[1] / (pairs.structure * self.times[1] ** 2) for pairs in self.dispersion]
         return float(np.mean(ratios)) if ratios else np.nan
 
 
 def first_exponent(x: np.ndarray, y: np.ndarray) -> float:
-    """Slope of log y over log x between the first two points; NaN with fewer points, or if y is 0."""
+    """Slope of log y over log x between the first two points; NaN with fewer points, or if y[0] is not positive."""
     return float(np.log(y[1] / y[0]) / np.log(x[1] / x[0])) if len(x) > 1 and y[0] > 0 else np.nan
 
 

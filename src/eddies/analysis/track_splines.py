@@ -21,8 +21,8 @@ from scipy.optimize import brentq
 from scipy.sparse import csr_array, dia_array
 
 DEGREE, LEAST_ROWS = 3, 3   # fewer rows do not determine a parabola, which has no jerk
-NO_NOISE, MOST = 1e-6, 1e6  # smallest and largest mu: below the smallest no frequency that frames resolve is damped
-TRIED = 300                 # tracks by which mu is chosen
+NO_NOISE, MOST = 1e-6, 1e6  # smallest and largest mu; the smallest damps no frequency that frames resolve
+TRIED = 300                 # about the number of tracks from which mu is determined
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
     ----------
     time, track : (rows,), in any order. position : (rows, 3), wrapped or not.
     edge : of a periodic cube; None: there is none. Particles move by less than half of it between two rows of a track.
-    noise : standard deviation of a coordinate. The splines differ from the positions by as much, less the degrees of
-        freedom of the splines.
+    noise : standard deviation of the error of a coordinate. It determines mu: the squared residuals sum up to noise^2
+        times their degrees of freedom.
     """
     order = np.lexsort((time, track))
     ends = np.flatnonzero(np.diff(track[order], append=track[order][-1] - 1)) + 1
@@ -73,7 +73,7 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
 
 
 class Fit:
-    """The splines of tracks with the same times (n,); positions (tracks, n, 3); h of the penalty."""
+    """The splines of tracks with the same times (n,) and positions (tracks, n, 3); `interval` is h of the penalty."""
 
     def __init__(self, times: np.ndarray, positions: np.ndarray, interval: float) -> None:
         self.times, self.tracks = times, len(positions)
@@ -96,7 +96,7 @@ class Fit:
         return BSpline(self._knots, solveh_banded(bands, right, lower=True), DEGREE)
 
     def residual(self, smoothing: float) -> tuple[float, float]:
-        """Sum of the squared residuals, and the degrees of freedom that they have: values less those of the splines."""
+        """Sum of the squared residuals, and their degrees of freedom: number of values minus those of the splines."""
         squares = float(np.sum((self.spline(smoothing)(self.times) - self._values) ** 2))
         influence = self.spline(smoothing, np.eye(len(self.times)))(self.times)
         return squares, 3 * self.tracks * (len(self.times) - float(np.trace(influence)))
@@ -129,7 +129,7 @@ def _smoothing_of(fits: list[Fit], noise: float) -> float:
 
 
 def _unwrapped(positions: np.ndarray, edge: float | None) -> np.ndarray:
-    """Continuous positions (tracks, n, 3) from those in a periodic cube; None: in no such cube."""
+    """Continuous positions (tracks, n, 3) from those in a periodic cube; `edge` None: no periodic cube."""
     if edge is None:
         return positions
     moved = np.diff(positions, axis=1)

@@ -54,7 +54,7 @@ class InvariantBins:
 
     @classmethod
     def covering(cls, second: np.ndarray, third: np.ndarray, quantile: float = 0.999) -> "InvariantBins":
-        """Symmetric ranges that hold this fraction of the sample, in 12 to 64 bins for its size."""
+        """Symmetric ranges that hold this fraction of the sample, in 12 to 64 bins, by the size of the sample."""
         bins = int(np.clip(round(second.size ** (1 / 3)), 12, 64))
         limits = [np.quantile(np.abs(values), quantile) for values in (second, third)]
         return cls(*(np.linspace(-limit, limit, bins + 1) for limit in limits))

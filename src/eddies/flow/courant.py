@@ -55,11 +55,11 @@ class FixedStep:
         return self.step if clock.remaining > self.step * (1 - 1e-6) else clock.remaining
 
     def state_dict(self) -> dict[str, float]:
-        """Return nothing: the step comes from the scene."""
+        """Return an empty state: the step comes from the scene."""
         return {}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """Restore nothing."""
+        """Ignore the empty state."""
 
     def bound(self, state: np.ndarray, clock: Clock) -> float:
         return self.step

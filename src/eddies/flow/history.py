@@ -19,7 +19,7 @@ EVERY = 4  # steps between two samples
 
 
 class FlowHistory:
-    """Observer that measures a flow every few steps: `rows` has one entry a sample, `spectra` the E(k) of each.
+    """Observer that measures a flow every few steps: `rows` has one entry per sample, `spectra` the E(k) of each.
 
     It also integrates the energy budget. `budget_error` is |E(t) - E(0) - integral of (injection - dissipation)|
     divided by the dissipated energy, or by E(0) where nothing is dissipated.
@@ -38,7 +38,7 @@ class FlowHistory:
             self.sample(state, clock)
 
     def sample(self, state: np.ndarray, clock: Clock) -> dict[str, float]:
-        """Return the row of this step; measure and store it unless the last row is of this step.
+        """Return the row of this step. It is measured and stored unless the last row already is the one of this step.
 
         Raises FlowDiverged if the flow is not finite.
         """

@@ -31,14 +31,14 @@ def velocity_of_spectrum(grid: SpectralGrid, seed: int, wavenumber: np.ndarray, 
 
 
 def _gaussian_solenoidal(grid: SpectralGrid, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a solenoidal velocity of normal numbers without a mean, and its spectrum."""
+    """Return a solenoidal velocity of normally distributed modes without a mean, and its spectrum."""
     velocity = grid.solenoidal(_gaussian_modes(grid, seed))
     velocity[:, grid.index_squared == 0] = 0
     return velocity, energy_spectrum(grid, velocity)[1]
 
 
 def _with_spectrum(grid: SpectralGrid, velocity: np.ndarray, energy: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return a velocity whose shells with the spectrum `energy` have the spectrum `target`."""
+    """Return the velocity with its shells scaled from their spectrum `energy` to the spectrum `target`."""
     scale = np.sqrt(np.divide(target, energy, out=np.zeros(len(energy)), where=energy > 0))
     return (velocity * scale[grid.shell_number]).astype(grid.complex)
 
@@ -87,7 +87,7 @@ def sound_wave_density(grid: SpectralGrid, amplitude: float, wavenumber: int) ->
 
 
 def balanced_density(grid: SpectralGrid, velocity: np.ndarray, sound_speed: float) -> np.ndarray:
-    """Return s = p / c^2 (kz, ky, kx) with the incompressible pressure p: the start emits almost no sound."""
+    """Return s = p / c^2 (kz, ky, kx) with the incompressible pressure p, with which a flow emits almost no sound."""
     return grid.pressure_of(grid.squares(velocity)) / sound_speed**2
 
 

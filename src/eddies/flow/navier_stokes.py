@@ -10,10 +10,10 @@ from eddies.flow.subgrid import Closure
 from eddies.kernels.flow import Formulas
 from eddies.kernels.library import library
 from eddies.spectral.spectral_grid import SpectralGrid
-from eddies.time_stepping import Equation, ScalarFunction, divided_difference
+from eddies.time_stepping import ScalarFunction, divided_difference
 
 
-class Fluid(Equation):
+class Fluid:
     """Equations of a flow. A fluid of your own is built with the same arguments; derive it from one of the two below.
 
     Parameters
@@ -40,7 +40,7 @@ class Fluid(Equation):
 class IncompressibleFluid(Fluid):
     """u_t = P[u x omega + f] + nu laplacian u,  P the projection on solenoidal fields, which absorbs p + |u|^2 / 2.
 
-    The force of a closure is projected as well. An evaluation takes nine transforms; eight of them are sent.
+    The force of a closure is projected as well. An evaluation takes nine transforms; ranks exchange data for eight.
     """
 
     compressible, transforms = False, 9
@@ -79,8 +79,8 @@ class CompressibleFluid(Fluid):
         u_t = -c^2 grad s + nu (laplacian u + 1/3 grad div u) - u.grad u + 2 nu (S - 1/3 div u).grad s + f
 
     S is the rate of strain. All nonlinear terms but a closure's force are quadratic, so the 2/3 rule dealiases them
-    exactly. An evaluation takes fifteen transforms back (u and the gradients of u and s) and four forth. Eight of the
-    first are sent, because derivatives along x and y are taken after the transform along z.
+    exactly. An evaluation takes fifteen backward transforms (u and the gradients of u and s) and four forward ones.
+    Ranks exchange data for only eight backward transforms: derivatives along x and y follow the transform along z.
     """
 
     compressible, transforms = True, 19
@@ -160,5 +160,5 @@ def functions_of_wavenumber(grid: SpectralGrid, functions: Callable[[np.ndarray]
     return np.stack([row[index_squared].astype(grid.real) for row in table], axis=2)
 
 
-#: The fluids that [flow] fluid names by a word.
+#: The fluids by their names in [flow] fluid.
 FLUIDS: dict[str, type[Fluid]] = {"incompressible": IncompressibleFluid, "compressible": CompressibleFluid}

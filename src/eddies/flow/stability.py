@@ -44,7 +44,7 @@ class FlowDiverged(UserError, RuntimeError):
 
 @dataclass(frozen=True)
 class StepLimit:
-    """Number that grows with the time step, and the boundary up to which the step is stable."""
+    """A stability limit: a number that grows with the time step, and the boundary up to which the step is stable."""
 
     name: str
     expression: str
@@ -75,11 +75,11 @@ def limits_of_step(k_max: float, step: float, speed: float, viscosity: float, ex
     -3 nu k_max^2, or -4 nu k_max^2 in a compressible fluid. RK4 is stable up to where its region meets the axes.
 
     ETDRK4 treats viscosity and sound exactly. Without them its region is as for RK4. Viscosity widens it: it reaches
-    3.2, 3.9 and 4.9 at nu k^2 step = 1, 3 and 5, and about 0.7 nu k^2 step beyond. Undamped sound makes it leak: waves
-    with c k step between 1 and 7 grow. In a uniform flow they grow by up to 0.1, 2, 7 and 15 % a step at an advective
-    number of 0.5, 1, 1.5 and 2. A damping 2/3 nu k^2 step of 0.0013, 0.024, 0.1 and 0.22 stops them. Turbulence, where
-    few points move at the largest speed, took 60 steps at three times the boundary without tenfold energy (12^3 cells,
-    M_t from 0.01 to 0.5).
+    3.2, 3.9 and 4.9 at nu k^2 step = 1, 3 and 5, and about 0.7 nu k^2 step beyond. With undamped sound, waves with
+    c k step between 1 and 7 grow also inside it. In a uniform flow they grow by up to 0.1, 2, 7 and 15 % per step at an
+    advective number of 0.5, 1, 1.5 and 2. A damping 2/3 nu k^2 step of 0.0013, 0.024, 0.1 and 0.22 stops them. In
+    turbulence few points move at the largest speed: 60 steps at three times the boundary did not raise its energy
+    tenfold (12^3 cells, M_t from 0.01 to 0.5).
     """
     limits = [StepLimit("advection", "step x k_max x max(|u| + |v| + |w|)", step * k_max * speed, IMAGINARY_REACH)]
     if explicit:

@@ -7,7 +7,7 @@ from eddies.spectral.spectral_grid import SpectralGrid
 
 
 def energy_spectrum(grid: SpectralGrid, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return k = 0, 1, ... and E(k), the energy of the modes with |k| rounded to k; sum E = <u.u>/2."""
+    """Return k = 0, 1, ... and E(k), the energy of the modes whose |k| rounds to k; sum E = <u.u>/2."""
     shells = int(np.ceil(np.sqrt(3) * grid.cutoff)) + 1
     density = 0.5 * grid.multiplicity * (np.abs(velocity) ** 2).sum(axis=0)
     spectrum = np.bincount(grid.shell_number.ravel(), density.ravel().astype(float), minlength=shells)
@@ -25,7 +25,7 @@ def turbulence_scales(spectrum: np.ndarray, dissipation_rate: float, viscosity: 
     """Return scales of isotropic turbulence from E(k), the dissipation rate eps and the viscosity nu.
 
     u' = sqrt(2E/3), L = pi/(2u'^2) sum E/k, T = L/u', lambda = sqrt(15 nu u'^2/eps), Re_lambda = u' lambda/nu,
-    eta = (nu^3/eps)^(1/4), t_eta = sqrt(nu/eps) (Pope 2000, chapter 6). Without viscosity viscous scales are 0 or inf.
+    eta = (nu^3/eps)^(1/4), t_eta = sqrt(nu/eps) (Pope 2000, chapter 6). If nu or eps is 0, viscous scales are 0 or inf.
     """
     energy = spectrum.sum()
     u_rms = np.sqrt(2 * energy / 3)
@@ -66,7 +66,7 @@ def _powers(values: np.ndarray) -> np.ndarray:
 
 
 def _skewness_and_flatness(moments: np.ndarray) -> tuple[float, float]:
-    """Return averages over the components of the second, third and fourth moments (3, c)."""
+    """Return skewness and flatness, averaged over the components, from moments of order 2, 3 and 4 (3, c)."""
     second, third, fourth = moments
     if not np.all(second > 0):
         return 0.0, 0.0

@@ -1,4 +1,4 @@
-"""Subgrid closures: models of the force that scales removed by a coarse grid or a filter exert on the others."""
+"""Subgrid closures: models of the force that the scales removed by a coarse grid or a filter exert on the rest."""
 
 from collections.abc import Callable
 
@@ -19,7 +19,7 @@ class Closure:
     """Base of all closures. Velocities and forces are modes (3, kz, ky, kx)."""
 
     def begin_step(self, velocity: np.ndarray) -> None:
-        """Measure, in the velocity at the start of a step, what stays constant during it; collective."""
+        """Measure quantities that stay constant during a step, in the velocity at its start; collective."""
 
     def add(self, velocity: np.ndarray, tendency: np.ndarray) -> None:
         """Add the force to the velocity's tendency in place."""
@@ -79,10 +79,10 @@ class DynamicStress(StressModel):
 
         l^2 = max(<(L - H):M> / <M:M>, 0),   L = (uu)^ - u^ u^,   M = 2 ((|S|S)^ - r |S^|S^).
 
-    ^ is a test filter. r is the squared ratio of two widths, of both filters combined and of the first filter. H is the
-    gradient part of both filters combined minus the test-filtered gradient part of the first filter. Without a filter
-    width the first filter is the grid, and ^ cuts off above half its highest wavenumber. All tensors then have only the
-    modes below this cutoff. With a width d the first filter is Gaussian of width d, ^ is Gaussian of width 2 d, and
+    ^ is a test filter. r is the squared width of both filters combined over that of the first filter. H is the gradient
+    part of both filters combined minus the test-filtered gradient part of the first filter. Without a filter width the
+    first filter is the grid, and ^ cuts off above half its highest wavenumber. All tensors then have only the modes
+    below this cutoff. With a width d the first filter is Gaussian of width d, ^ is Gaussian of width 2 d, and
     r = 5.
     """
 
@@ -156,7 +156,7 @@ class EddyDamping(ModeDamping):
 
 
 def strain_product(gradients: np.ndarray) -> np.ndarray:
-    """Return |S| S (6, ...) of velocity gradients (9, ...), the component running faster than the direction."""
+    """Return |S| S (6, ...) of velocity gradients (9, ...), in which the component index runs fastest."""
     d_dx, d_dy, d_dz = gradients.reshape(3, 3, *gradients.shape[1:])
     strain = np.stack([d_dx[0], d_dy[1], d_dz[2],
                        (d_dx[1] + d_dy[0]) / 2, (d_dx[2] + d_dz[0]) / 2, (d_dy[2] + d_dz[1]) / 2])
@@ -165,6 +165,6 @@ def strain_product(gradients: np.ndarray) -> np.ndarray:
 
 
 def gradient_product(gradients: np.ndarray) -> np.ndarray:
-    """Return d_k u_i d_k u_j (6, ...) of velocity gradients (9, ...), the component running faster."""
+    """Return d_k u_i d_k u_j (6, ...) of velocity gradients (9, ...), in which the component index runs fastest."""
     u, v, w = np.moveaxis(gradients.reshape(3, 3, *gradients.shape[1:]), 1, 0)
     return np.stack([(a * b).sum(axis=0) for a, b in ((u, u), (v, v), (w, w), (u, v), (u, w), (v, w))])

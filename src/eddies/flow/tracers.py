@@ -31,7 +31,9 @@ def lattice_positions(seed: int, per_side: int, start: int, stop: int, length: f
 
 
 def release(decomposition: SlabDecomposition, seed: int, total: int, placement: str) -> dict[str, np.ndarray]:
-    """Return ids and positions of new particles, each on the rank whose slab holds it. A lattice needs a cube of them.
+    """Return ids and positions of new particles, each on the rank whose slab holds it.
+
+    `placement` is "random" or "lattice"; on a lattice `total` is a cubic number.
     """
     start, stop = id_block(decomposition.comm, total)
     if placement == "random":

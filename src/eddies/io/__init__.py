@@ -1,1 +1,1 @@
-"""HDF5 files: products of the stages, trajectories, fields and weights. The only home of h5py."""
+"""HDF5 files: products of the stages, trajectories, fields and weights. Only this package imports h5py."""

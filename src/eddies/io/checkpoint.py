@@ -1,8 +1,8 @@
 """Checkpoints: files step-NNNNNNNN.h5 with global arrays, which do not depend on the number of ranks.
 
-They are written as io/new_files.py says. Settings, and values that are not arrays, are one dataset of JSON. Checksums
-(io/checksums.py) cover every byte, and a damaged checkpoint is not used. A checkpoint may belong together with other
-files of its directory, whose checksums it knows.
+io/new_files.py describes how they are written. Settings and values that are not arrays are stored together, as one
+dataset of JSON. Checksums (io/checksums.py) cover every byte, and a damaged checkpoint is not used. Other files of the
+directory may belong to a checkpoint, which then stores their checksums.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ log = logging.getLogger("eddies")
 KEPT = 3
 NAME = re.compile(r"step-(\d{8,})(\.h5)?")
 PLAIN = "plain"  # the dataset of everything that is not an array, as JSON
-FORMAT = 11  # of the layout; others are not used. Raise it also with the format of products: frames are such.
+FORMAT = 11  # of the layout; others are not used. Raise it also with FORMAT of io/provenance.py: frames are products.
 
 
 @dataclass(frozen=True)
 class Block:
-    """This rank's part of a global array: rows start, start + 1, ... of `total` along an axis; maybe none."""
+    """This rank's part of a global array: rows start, start + 1, ... of `total` along an axis, or no row."""
 
     values: np.ndarray
     start: int
@@ -54,13 +54,13 @@ class Block:
 
 @dataclass(frozen=True)
 class Checkpoint(Mapping):
-    """A sound checkpoint: the state that was given to `CheckpointDirectory.write`, by name."""
+    """An undamaged checkpoint, which maps names to the state that `CheckpointDirectory.write` was given."""
 
     path: Path
 
     @cached_property
     def content(self) -> dict[str, Any]:
-        """Step, format, fingerprint, what computed it, checksums of other `files` by name, and the plain `values`."""
+        """Step, format, fingerprint, kernels and threads, checksums of other `files` by name, and plain `values`."""
         return json.loads(self.read(PLAIN).tobytes())
 
     @property
@@ -79,7 +79,7 @@ class Checkpoint(Mapping):
         return sum(1 for _ in self)
 
     def read(self, name: str, start: int = 0, stop: int | None = None, axis: int = 0) -> np.ndarray:
-        """Rows start to stop of an array along an axis; every rank reads what it needs."""
+        """Rows start, ..., stop - 1 of an array along an axis. Not collective: each rank reads what it needs."""
         with open_to_read(self.path) as file:
             return file[name][(slice(None),) * axis + (slice(start, stop),)]
 
@@ -92,10 +92,11 @@ class CheckpointDirectory:
         self.comm, self.path, self.fingerprint = comm, path, fingerprint
 
     def write(self, step: int, state: Mapping[str, Any], files: Sequence[str] = ()) -> None:
-        """Add a checkpoint, and keep the newest few. If it cannot be written, the earlier ones are intact.
+        """Add a checkpoint, and remove all but the newest KEPT. If it cannot be written, earlier ones stay intact.
 
         `state` holds `Block`s of arrays, other arrays, and values for JSON. Arrays and values are taken from rank 0,
-        because the ranks may have measured different times. `files` names closed files here that belong to it.
+        because the ranks may have measured different times. `files` are names of closed files of the directory, which
+        belong to the checkpoint.
         """
         path = self.path / f"step-{step:08d}.h5"
         arrays = {name: part for name, part in state.items() if isinstance(part, np.ndarray | Block)}
@@ -121,10 +122,10 @@ class CheckpointDirectory:
         in_files(self.comm, self.path, lambda: [old.unlink() for old in _newest_first(self.path)[KEPT:]])
 
     def newest(self) -> Checkpoint | None:
-        """The newest sound checkpoint with these settings. Everything else in the directory is removed; a warning says
-        why a complete checkpoint is not used.
+        """The newest undamaged checkpoint with these settings, or None. It, its files and older checkpoints are kept;
+        everything else in the directory is removed. A warning says why a newer checkpoint is not used.
 
-        Raises ProductError, and removes nothing, if the system refuses to read a file, which may be sound.
+        Raises ProductError, and removes nothing, if the system refuses to read a file: it may be undamaged.
         """
         paths = in_files(self.comm, self.path, lambda: _newest_first(self.path))
         while paths and (complaint := self._complaint(paths[0])):
@@ -133,7 +134,7 @@ class CheckpointDirectory:
             paths.pop(0)
         newest = Checkpoint(paths[0]) if paths else None
         if newest is not None and self.comm.rank == 0 and newest.content["computed_by"] != _computed_by():
-            log.warning("the checkpoint was made with %s, and this run has %s: it continues, but not bit for bit",
+            log.warning("the checkpoint was made with %s, but this run has %s: the run continues, but not bit for bit",
                         newest.content["computed_by"], _computed_by())
         kept = {path.name for path in paths}.union(() if newest is None else newest.files)
 
@@ -154,7 +155,7 @@ class CheckpointDirectory:
         """Why a checkpoint cannot be used, or None; the same on all ranks."""
         content = in_files(self.comm, path, lambda: _content(path))
         if content is None:
-            return find_damage(self.comm, path) or f"{path}: is no checkpoint"
+            return find_damage(self.comm, path) or f"{path}: is not a checkpoint"
         if content["format"] != FORMAT:
             return f"{path}: was made by another version of eddies"
         if content["fingerprint"] != self.fingerprint:
@@ -164,9 +165,9 @@ class CheckpointDirectory:
 
 
 class Guard:
-    """Writer of the checkpoints that are due, which also stops the run on request. All methods are collective.
+    """Writes the checkpoints that are due, and stops the run on request. All methods are collective.
 
-    `of` follows the step number in the message of a stop, such as " of the training".
+    `of`, such as " of the training", follows the step number in the message about a stop.
     """
 
     def __init__(self, comm: MPI.Comm, directory: Path, fingerprint: str, stop: StopRequest | None,
@@ -177,14 +178,14 @@ class Guard:
     def __call__(self, run: Any, segments: FrameSegments | None = None) -> None:
         """Call it before each step of a `run` with `steps` and `state_dict()`, whose frames go to `segments`.
 
-        Raises Stopped after the checkpoint is complete.
+        If the run has to stop, it raises Stopped after the checkpoint is complete.
         """
         stopping = self.stop()
         if self.stop.checkpoint_due:
             self.save(run, segments)
             self.stop.checkpoint_done()
         if stopping:
-            raise Stopped(self.stop.reason, f"from step {run.steps}{self.of}")
+            raise Stopped(self.stop.reason, f"continues from step {run.steps}{self.of}")
 
     def save(self, run: Any, segments: FrameSegments | None = None) -> None:
         """Write a checkpoint of the present state."""
@@ -205,7 +206,7 @@ def checkpoints_in(path: Path) -> list[tuple[int, str]]:
 
 
 def _newest_first(directory: Path) -> list[Path]:
-    """The checkpoints in a directory. Up to version 1, a checkpoint was a directory."""
+    """The checkpoints in a directory, the newest first. Up to version 1, a checkpoint was a directory."""
     paths = directory.iterdir() if directory.is_dir() else ()
     return sorted((path for path in paths if (name := NAME.fullmatch(path.name)) and path.is_dir() == (not name[2])),
                   key=_step_of, reverse=True)
@@ -228,15 +229,15 @@ def _content(path: Path) -> dict[str, Any] | None:
 
 
 def _computed_by() -> str:
-    """The kernels and threads; a result depends on them in its last bits."""
+    """The kernels and the number of threads. The last bits of a result depend on them."""
     return f"compiled kernels: {in_use()}, threads a rank: {threads()}"
 
 
 def _write_array(file: h5py.File, name: str, block: Block) -> None:
     """Write a global array from the blocks of all ranks.
 
-    Blocks that are cut along a later axis than the first are written one component at a time: MPI counts bytes in 32
-    bits, and a single writer holds each written part in memory.
+    Blocks that are distributed along another axis than the first are written one component at a time: MPI counts bytes
+    in 32 bits, and a single writer holds each written part in memory.
     """
     values, axis = block.values, block.axis
     shape = (*values.shape[:axis], block.total, *values.shape[axis + 1:])

@@ -1,8 +1,8 @@
 """Checksums of HDF5 files: the CRC-32 of every 4096 bytes, in a table after the end of the HDF5 data.
 
 They cover all bytes, also those of HDF5's own structure. `open_to_read` opens a file so that each block is compared
-with its checksum before HDF5 sees it: a reader of a few frames compares only these, on any number of ranks.
-`add_checksums` and `find_damage` treat a whole file; the ranks share the blocks. Only they load MPI.
+with its checksum before HDF5 sees it: a reader of a few frames checks only their blocks, on any number of ranks.
+`add_checksums` and `find_damage` process a whole file; the ranks share the blocks. Only these two import MPI.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ BLOCK_BYTES = 2**12
 FOOTER, MARK = struct.Struct("<Q16s"), b"eddies CRC-32 4K"
 # A file with this attribute had a table. If the table is missing, another program has cut it off.
 ATTRIBUTE = "checksums"
-WORDS = f"behind the end of the HDF5 file: CRC-32 of every {BLOCK_BYTES} bytes, as little-endian integers of 4 bytes"
-MISSING = "its checksums are missing: it was cut off, or another program has changed it"
+WORDS = f"after the end of the HDF5 data: CRC-32 of every {BLOCK_BYTES} bytes, as little-endian integers of 4 bytes"
+MISSING = "its checksums are missing: the file was cut off, or another program has changed it"
 PIECE = 2**10  # blocks per read
 NAMED = 3  # datasets that an error names
 
 
 def open_to_read(path: str | Path) -> h5py.File:
-    """Open any HDF5 file for reading, with comparison if it has checksums.
+    """Open any HDF5 file for reading. If it has checksums, all bytes that are read are compared with them.
 
-    HDF5's own file lock is not used: some network file systems have none. A run directory has a lock of its own, and a
-    product gets its name only when it is complete.
+    HDF5's own file lock is not used: some network file systems do not support it. A run directory has a lock of its
+    own, and a product gets its name only when it is complete.
 
     Raises:
-        OSError: the file cannot be opened.
-        ProductError: here or at a later read, bytes differ from their checksums.
+        OSError: the file cannot be opened, or its checksums are missing.
+        ProductError: bytes differ from their checksums, now or at a later read.
     """
     with _opened(path) as descriptor:
         checked = _covered_bytes(descriptor) is not None
@@ -67,7 +67,7 @@ class CheckedFile:
         self._size = _covered_bytes(self._descriptor) or 0
 
     def __repr__(self) -> str:
-        return str(self.path)  # h5py takes it as the name of the file
+        return str(self.path)  # h5py uses it as the name of the file
 
     def __del__(self) -> None:
         if self._descriptor is not None:
@@ -82,7 +82,7 @@ class CheckedFile:
         return self._at
 
     def readinto(self, buffer: memoryview) -> int:
-        """Fill a buffer from the position on; ProductError if bytes differ from their checksums."""
+        """Fill a buffer with the bytes from the position on. ProductError if bytes differ from their checksums."""
         done, size = 0, min(len(buffer), self._size - self._at)
         while done < size:
             first, skipped = divmod(self._at + done, BLOCK_BYTES)
@@ -94,11 +94,11 @@ class CheckedFile:
             done += len(part)
         return done
 
-    read = readinto  # h5py asks for a method of this name, but calls the other
+    read = readinto  # h5py requires this method, but calls `readinto`
 
 
 def add_checksums(comm: MPI.Comm, path: Path) -> None:
-    """Append checksums to a file that all ranks have closed; collective. WriteError on all ranks."""
+    """Append checksums to a file that all ranks have closed; collective. WriteError, on all ranks, if that fails."""
     from eddies.parallel.broadcast import on_all_ranks, on_first_rank
     from eddies.parallel.reduction import global_sum
     comm.Barrier()  # all have closed it
@@ -124,7 +124,7 @@ def add_checksums(comm: MPI.Comm, path: Path) -> None:
 
 
 def known_sums(path: Path) -> int | None:
-    """A checksum of a file's checksums, which identifies the file; None if it has none."""
+    """A checksum of all checksums of a file, which identifies the file; None if it has no checksums."""
     with _opened(path) as descriptor:
         size = _covered_bytes(descriptor)
         return None if size is None else zlib.crc32(_read_table(descriptor, 0, _count_blocks(size), size), size)
@@ -134,7 +134,7 @@ def find_damage(comm: MPI.Comm, path: Path, known: int | None = None) -> str | N
     """Compare a file with its checksums; collective.
 
     Returns a line with file, dataset and frame of the first damage, or None. `known` is the result of `known_sums` for
-    the expected file. Raises ProductError, on all ranks, if the system refuses to read the file, which may be sound.
+    the expected file. Raises ProductError, on all ranks, if the system refuses to read the file: it may be undamaged.
     """
     from eddies.parallel.broadcast import on_all_ranks, on_first_rank
     from eddies.parallel.reduction import global_min
@@ -145,7 +145,7 @@ def find_damage(comm: MPI.Comm, path: Path, known: int | None = None) -> str | N
         with _opened(path) as descriptor:
             size = _covered_bytes(descriptor)
         if size is not None and known not in (None, known_sums(path)):
-            return f"{path}: is another file than was written"
+            return f"{path}: is not the file that was written, its checksums are different"
         return f"{path}: {MISSING}" if size is None else size
 
     def first_wrong() -> int:
@@ -187,7 +187,7 @@ def _covered_bytes(descriptor: int) -> int | None:
 
 
 def _own_pieces(comm: MPI.Comm, size: int) -> Iterator[tuple[int, memoryview]]:
-    """This rank's share of the blocks of a file, in pieces: the first block, and a buffer for the piece."""
+    """This rank's share of the blocks of a file, in pieces. Yields the first block of each, and a buffer for it."""
     from eddies.parallel.slab import block_starts
     start, stop = map(int, block_starts(_count_blocks(size), comm.size)[comm.rank:comm.rank + 2])
     buffer = memoryview(bytearray(PIECE * BLOCK_BYTES))
@@ -196,14 +196,14 @@ def _own_pieces(comm: MPI.Comm, size: int) -> Iterator[tuple[int, memoryview]]:
 
 
 def _first_wrong(descriptor: int, first: int, part: memoryview, size: int, skipped: int = 0) -> int | None:
-    """Fill `part` as `_read_sums` does; the first block that differs from its checksum, or None."""
+    """Fill `part` as `_read_sums` does. Returns the first block that differs from its checksum, or None."""
     sums = _read_sums(descriptor, first, part, size, skipped)
     wrong = np.flatnonzero(sums != _read_table(descriptor, first, first + len(sums), size))
     return first + int(wrong[0]) if wrong.size else None
 
 
 def _read_table(descriptor: int, first: int, last: int, size: int) -> np.ndarray:
-    """The stored checksums of blocks first to last."""
+    """The stored checksums of the blocks first, ..., last - 1."""
     return np.frombuffer(os.pread(descriptor, 4 * (min(last, _count_blocks(size)) - first), size + 4 * first), "<u4")
 
 
@@ -223,7 +223,7 @@ def _damage(path: Path, block: int, naming: bool = True) -> str:
     start, stop = block * BLOCK_BYTES, (block + 1) * BLOCK_BYTES
     place = f"bytes {start} to {stop}"
     place = f"{_place(path, start, stop)} ({place})" if naming else place
-    return f"{path}: {place} is not what was written, the file is damaged"
+    return f"{path}: the file is damaged: wrong checksum of {place}"
 
 
 def _place(path: Path, start: int, stop: int) -> str:
@@ -240,8 +240,8 @@ def _place(path: Path, start: int, stop: int) -> str:
     try:
         with h5py.File(CheckedFile(path, naming=False), "r") as file:
             file.visititems(look)
-    except ProductError:  # the damaged bytes say where the datasets are
-        names.append("the structure of the file, or what lies beside it,")
+    except ProductError:  # HDF5 needs the damaged bytes to find the datasets
+        names.append("the structure of the file, or data beside it")
     return " or ".join(names[:NAMED]) or "the structure of the file"
 
 

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 
 from eddies.io.checksums import open_to_read
-from eddies.io.errors import ProductError
+from eddies.io.errors import ProductError, make_again, unreadable
 from eddies.io.quantities import python_value, words_on
 
 try:
@@ -30,12 +30,12 @@ EDGE = 2 * math.pi  # of the cube, in units of L
 
 @dataclass(frozen=True)
 class MadeArray:
-    """An array that no file holds; its frames, along the first axis, are computed when they are used."""
+    """An array that is not in a file. Its frames, along the first axis, are computed when they are used."""
 
     place: str  # the path that it would have in rollout.h5, which gives its units and description
     shape: tuple[int, ...]
     dtype: np.dtype
-    make: Callable[[Sequence[int]], Sequence[np.ndarray]]  # returns some frames
+    make: Callable[[Sequence[int]], Sequence[np.ndarray]]  # returns the frames with these indices
 
     @classmethod
     def of(cls, place: str, values: np.ndarray) -> MadeArray:
@@ -62,7 +62,7 @@ class MadeArray:
 
 
 def open_group(path: Path, name: str) -> Any:
-    """The arrays of a group of a product, by name; for a group of trajectories the `value` of each column.
+    """The arrays of a group of a product, by name; for trajectories, the `value` of each column.
 
     ProductError if there is no such group or file.
     """
@@ -108,7 +108,8 @@ def opened(path: Path) -> h5py.File:
     try:
         return open_to_read(path)
     except OSError as error:
-        raise ProductError(f"{path}: cannot be opened ({error}); make it with the stage of this name") from None
+        raise unreadable(path, error) or ProductError(
+            f"{path}: cannot be opened ({error}); {make_again(path.stem)}") from None
 
 
 def _dataset(arrays: Mapping[str, tuple[Any, Callable[[tuple], np.ndarray]]], attributes: Mapping[str, Any]) -> Any:
@@ -135,7 +136,7 @@ def _dataset(arrays: Mapping[str, tuple[Any, Callable[[tuple], np.ndarray]]], at
 
 if xarray is not None:
     class LazyArray(BackendArray):
-        """An array that xarray reads only in the parts that are used."""
+        """An array of which xarray reads only the parts that are used."""
 
         def __init__(self, array: h5py.Dataset | MadeArray, read: Callable[[tuple], np.ndarray]) -> None:
             self.shape, self.dtype, self._read = array.shape, array.dtype, read

@@ -1,4 +1,4 @@
-"""Errors about files that users see: file, reason and remedy in one line."""
+"""Errors about files, for users: file, reason and remedy in one line."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from eddies.errors import UserError
 from eddies.pipeline import MAKER_OF
 
-# A full disk, a used-up quota, a file above the limit of its size.
+# A full disk, a used-up quota, a file larger than is allowed.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -25,7 +25,7 @@ class WriteError(ProductError):
 
 
 def write_error(path: Path | str, error: OSError, wanted: int = 0) -> WriteError:
-    """The error of a file that cannot be written, read or removed; if the disk is full, with the bytes wanted."""
+    """The error for a file that cannot be written, read or removed. If the disk is full, it names the bytes wanted."""
     reason = error.strerror or error
     if error.errno in NO_ROOM:
         return WriteError(f"{path}: cannot be written: {reason}: {room(path, wanted)}; make room, then run the command "
@@ -43,7 +43,7 @@ def file_errors(path: Path | str, wanted: int = 0) -> Iterator[None]:
 
 
 def room(path: Path | str, wanted: int) -> str:
-    """The bytes wanted for a file, unless unknown (0), and the free bytes of its file system, as text."""
+    """A text with the bytes wanted for a file, unless they are unknown (0), and the free bytes of its file system."""
     disk = os.statvfs(next(place for place in Path(path).absolute().parents if place.is_dir()))
     free = disk.f_bavail * disk.f_frsize
     if disk.f_files and not disk.f_favail:
@@ -52,7 +52,7 @@ def room(path: Path | str, wanted: int) -> str:
 
 
 def unreadable(path: Path | str, error: OSError) -> ProductError | None:
-    """The error of a file that the system does not let us read; None if HDF5 has found its content damaged."""
+    """The error for a file that the system refuses to read; None if HDF5 has found its content damaged."""
     if error.errno is None:
         return None
     return ProductError(f"{path}: cannot be read: {os.strerror(error.errno)}; check its permissions, its directory and "
@@ -60,5 +60,5 @@ def unreadable(path: Path | str, error: OSError) -> ProductError | None:
 
 
 def make_again(kind: str) -> str:
-    """The remedy for a useless product. Its stage would keep the file, so the user has to remove it."""
+    """The remedy for a product that cannot be used. Its stage would keep the file, so the user has to remove it."""
     return f"remove it and run `eddies {MAKER_OF[kind].name}` again" if kind in MAKER_OF else "make it again"

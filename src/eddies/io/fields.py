@@ -10,7 +10,7 @@ from eddies.io.hdf5 import append_frame, find_group, growing_dataset, read_frame
 
 
 class FieldWriter:
-    """Adds fields on cells^3 points to /fields/NAME in float32. Making one and `append` are collective.
+    """Adds fields on cells^3 points to /fields/NAME in float32. The constructor and `append` are collective.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class FieldWriter:
                            for variable, components in variables.items()}
 
     def append(self, time: float, start_plane: int, variables: Mapping[str, np.ndarray]) -> None:
-        """Add a field: this rank holds planes start_plane, ... as (components, z, y, x); z may be 0."""
+        """Add a field: this rank holds planes start_plane, ... as (components, planes, y, x), or no plane."""
         append_frame(self._time, np.array(time), ())
         for variable, dataset in self._variables.items():
             append_frame(dataset, variables[variable], (0, start_plane, 0, 0))
@@ -55,5 +55,5 @@ class FieldSeries:
         return times
 
     def read(self, index: int, variable: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Planes start to stop of a variable, (components, stop - start, y, x); ProductError if one is not finite."""
+        """Planes start, ..., stop - 1 of a variable, (components, stop - start, y, x). Errors as in `read_frame`."""
         return read_frame(self._group[variable], index, (slice(None), slice(start, stop)))

@@ -1,6 +1,6 @@
-"""States of a whole flow to start from: of a ground truth, or velocities on a periodic cube from other codes.
+"""Initial states of a whole flow: of a ground truth, or velocities on a periodic cube from other codes.
 
-Supported layouts of other codes, with arrays [z, y, x] and points from the corner of the cube on:
+Supported layouts of other codes, with arrays [z, y, x] whose first point is the corner of the cube:
 
 - cutouts of the Johns Hopkins Turbulence Databases (JHTDB), as pyJHTDB, giverny and givernylocal write them:
   `Velocity_0001` or `velocity_0001`, ... (z, y, x, component), numbered in time, and the points of each axis in
@@ -40,9 +40,9 @@ FILL_ATTRIBUTES = "_FillValue", "missing_value"
 # The first bytes of files in other formats, with a remedy.
 OTHER_FORMATS = {b"CDF": "a netCDF 3 file; convert it with `nccopy -k netCDF-4 OLD NEW`",
                  b"\x93NUMPY": "a NumPy array; store it in HDF5, or read it in a function that [initial] kind names",
-                 b"MATLAB 5": "a MATLAB file before version 7.3; save it with `-v7.3`, in one of the known layouts"}
+                 b"MATLAB 5": "a MATLAB file older than version 7.3; save it with `-v7.3`, in one of the known layouts"}
 FLUIDSIM_PARAMETERS = "info_simul/params/oper"
-PLACE_TOLERANCE = 0.01  # of a grid step: coordinates of cutouts have single precision
+PLACE_TOLERANCE = 0.01  # in grid steps: coordinates of cutouts have single precision
 
 
 class StoredStates(FieldSeries):
@@ -57,8 +57,8 @@ class StoredStates(FieldSeries):
 class VelocityCubes:
     """Velocities of another code at one or more times, with the interface of `FieldSeries`.
 
-    `states` has for each time one dataset (z, y, x, component), or three (z, y, x). ProductError if they are not
-    velocities on equally many points along each axis.
+    `states` holds, for each time, one dataset (z, y, x, component) or three datasets (z, y, x). ProductError if they
+    are not velocities with the same number of points along each axis.
     """
 
     variables, sound_speed = ("velocity",), None
@@ -72,7 +72,7 @@ class VelocityCubes:
             for dataset in state:
                 if dataset.dtype.kind in "iu":
                     raise ProductError(f"{_place(dataset)}: holds integers ({dataset.dtype}), perhaps packed with a "
-                                       "scale and an offset; store floating-point numbers, as `ncpdq -U` unpacks them")
+                                       "scale and an offset; store floating-point numbers, for example with `ncpdq -U`")
                 if dataset.shape != shape or dataset.dtype.kind != "f" or not self.cells:
                     raise ProductError(f"{_place(dataset)}: has type {dataset.dtype} and shape {dataset.shape}; a "
                                        "velocity with the same number of points along each axis is needed")
@@ -82,11 +82,11 @@ class VelocityCubes:
         return len(self._states)
 
     def read(self, index: int, variable: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Planes start to stop of the velocity, (3, stop - start, y, x); ProductError if they are damaged."""
+        """Planes start, ..., stop - 1 of the velocity, (3, stop - start, y, x). ProductError if a value is damaged."""
         return np.concatenate([_read_planes(dataset, start, stop) for dataset in self._states[index]])
 
     def check(self, comm: MPI.Comm, index: int, velocity: np.ndarray) -> None:
-        """Raise ProductError for a velocity that cannot be a flow; `velocity` has the planes of this rank."""
+        """Raise ProductError if the velocity cannot be that of a flow; `velocity`: planes of this rank; collective."""
         dataset = self._states[index][0]
         own = [np.ravel(dataset.attrs[name]) for name in FILL_ATTRIBUTES if name in dataset.attrs]
         fills = dict.fromkeys([*NOT_DELIVERED, *(float(value[0]) for value in own
@@ -111,7 +111,7 @@ class VelocityCubes:
 def open_states(comm: MPI.Comm, path: Path) -> Iterator[StoredStates | VelocityCubes]:
     """The states of the whole flow in a file; all ranks call it, and if one cannot read it, all raise ProductError.
 
-    A ground truth with tracers has states at a few times, one without has its last state.
+    A ground truth with tracers holds states at a few times; one without tracers holds only its last state.
     """
     if on_first_rank(comm, lambda: _is_product(path)):
         with open_product(comm, path, "ground_truth") as file:
@@ -122,10 +122,10 @@ def open_states(comm: MPI.Comm, path: Path) -> Iterator[StoredStates | VelocityC
 
 
 def _is_product(path: Path) -> bool:
-    """Whether a file is a product of this package. ProductError if it is missing or no HDF5 file."""
+    """Whether a file is a product of eddies. ProductError if it is missing or not an HDF5 file."""
     if not path.is_file():
-        raise ProductError(f"{path.absolute()}: {'is no regular file' if path.exists() else 'no such file'}; make it "
-                           "with `eddies dns SCENE`, or correct [initial] path, which is searched in the working "
+        raise ProductError(f"{path.absolute()}: {'is not a regular file' if path.exists() else 'no such file'}; make "
+                           "it with `eddies dns SCENE`, or correct [initial] path, which is searched in the working "
                            "directory and beside the scene")
     with _open(path) as file:
         return "kind" in file.attrs
@@ -141,7 +141,7 @@ def _open(path: Path) -> h5py.File:
             start = file.read(max(map(len, OTHER_FORMATS)))
         found = next((text for mark, text in OTHER_FORMATS.items() if start.startswith(mark)), None)
         raise ProductError(f"{path}: is {found}" if found else
-                           f"{path}: is no HDF5 file, or damaged ({error}); get or make it again") from None
+                           f"{path}: is not an HDF5 file, or is damaged ({error}); get or make it again") from None
 
 
 def _velocity_cubes(file: h5py.File) -> VelocityCubes:
@@ -170,8 +170,8 @@ def _cutouts(datasets: Sequence[h5py.Dataset]) -> VelocityCubes:
                                "plane repeats the first; leave out the last plane of each axis")
         if not np.abs(where - where[0] - step * np.arange(cubes.cells)).max() < PLACE_TOLERANCE * step:
             raise ProductError(f"{file.filename}: {name} goes from {where[0]:.6g} to {where[-1]:.6g} in {len(where)} "
-                               "points, which is not the whole periodic cube of edge 2 pi at equal distances; get all "
-                               "points of the cube, or every second, fourth, ...")
+                               "points, which are not equally spaced over the whole periodic cube of edge 2 pi; get "
+                               "all points of the cube, or every second, fourth, ...")
     return cubes
 
 
@@ -183,7 +183,7 @@ def _fluidsim_state(file: h5py.File) -> VelocityCubes:
         edges = [float(np.asarray(parameters.attrs[f"L{axis}"]).item()) for axis in "xyz"]
     except (AttributeError, KeyError, TypeError, ValueError):
         raise ProductError(f"{file.filename}: {FLUIDSIM_PARAMETERS} has no numbers Lx, Ly, Lz, the edges of the box; "
-                           "take a file as fluidsim writes it") from None
+                           "use a file as fluidsim writes it") from None
     if not edges[0] > 0 or not np.allclose(edges, edges[0], rtol=1e-9, atol=0):
         raise ProductError(f"{file.filename}: the box has the edges {', '.join(f'{edge:g}' for edge in edges)}; a "
                            "cube is needed")
@@ -191,7 +191,7 @@ def _fluidsim_state(file: h5py.File) -> VelocityCubes:
 
 
 def _dataset(file: h5py.File, name: str) -> h5py.Dataset:
-    """The dataset of a name. ProductError if it is something else, or if its values cannot be read."""
+    """The dataset with this name. ProductError if it is something else, or if its values cannot be read."""
     try:
         item = file[name]
     except KeyError as error:
@@ -209,7 +209,7 @@ def _dataset(file: h5py.File, name: str) -> h5py.Dataset:
     for code, *_, label in (filters.get_filter(number) for number in range(filters.get_nfilters())):
         if not h5py.h5z.filter_avail(code):
             raise ProductError(f"{_place(item)}: is compressed with {label.decode() or 'a filter'} (number {code}), "
-                               "which this HDF5 does not have; install its plugin and set HDF5_PLUGIN_PATH, or "
+                               "which this HDF5 library lacks; install its plugin and set HDF5_PLUGIN_PATH, or "
                                "recompress the file with `h5repack -f GZIP=4 OLD NEW` where it can be read")
     return item
 
@@ -230,9 +230,9 @@ def _place(dataset: h5py.Dataset) -> str:
 
 
 def read_spectrum(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Ascending wavenumbers and the energies E(k) >= 0 of a text file with both in each line; # begins a comment.
+    """Ascending wavenumbers k > 0 and energies E(k) >= 0 from a text file with one pair a line; # begins a comment.
 
-    One rank calls it. Raises ProductError for another content.
+    One rank calls it. Raises ProductError if the file holds something else.
     """
     try:
         with warnings.catch_warnings(action="ignore"):  # of an empty file
@@ -246,6 +246,6 @@ def read_spectrum(path: Path) -> tuple[np.ndarray, np.ndarray]:
                            "and E(k) in each line")
     wavenumber, energy = table.T
     if wavenumber[0] <= 0 or (np.diff(wavenumber) <= 0).any() or (energy < 0).any() or (energy > 0).sum() < 2:
-        raise ProductError(f"{path}: must have ascending wavenumbers above 0, and energies of at least 0, two of them "
-                           "above")
+        raise ProductError(f"{path}: must have ascending wavenumbers above 0, no energy below 0, and at least two "
+                           "energies above 0")
     return wavenumber, energy

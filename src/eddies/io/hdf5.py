@@ -1,6 +1,6 @@
-"""Products: HDF5 files that are complete or absent, say what they are, and are written by all ranks together.
+"""Products: HDF5 files that are complete or absent, describe themselves, and are written by all ranks together.
 
-`io/new_files.py` says how they are written. Every rank reads by itself.
+`io/new_files.py` describes how they are written. Each rank reads independently.
 """
 
 import json
@@ -19,11 +19,11 @@ from eddies.io.errors import ProductError, file_errors, make_again, unreadable
 from eddies.io.new_files import HEADER_BYTES, frame_bytes, new_file, own_part, writing
 from eddies.io.provenance import FORMAT, environment, has_this_format, identity, read_json, read_provenance
 from eddies.io.quantities import conventions, describe, python_value
-from eddies.parallel.broadcast import on_all_ranks, on_first_rank, share_text
+from eddies.parallel.broadcast import on_all_ranks, on_first_rank
 from eddies.pipeline import MAKER_OF
 
 CHUNK_BYTES = 2**20
-FEW = 9  # values, of which a chunk has many frames
+FEW = 9  # a chunk holds many frames if a frame has at most this number of values
 SERIES = "particles/", "fields/"  # groups whose datasets have frames
 File = h5py.File
 Result = TypeVar("Result")
@@ -52,7 +52,7 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
     """
     path = Path(path)
     with new_file(comm, path) as file:
-        origin = share_text(comm, "" if comm.rank else json.dumps({
+        origin = on_first_rank(comm, lambda: json.dumps({
             **environment(comm.size), **provenance, **identity(path.parent, provenance.get("made_from", ())),
             **{key: value for key, value in provenance.items() if key == "id"}}))
         with writing(file, len(origin) + HEADER_BYTES):
@@ -68,7 +68,7 @@ def open_product(comm: MPI.Comm, path: str | Path, kind: str | None) -> Iterator
     """Read a complete product of a kind (None: any kind). All ranks call it; if one cannot open it, all raise.
 
     Raises:
-        ProductError: the file is missing, truncated, no HDF5 file, unfinished, of another kind or of another format.
+        ProductError: the file is missing, truncated, not an HDF5 file, unfinished, or of another kind or format.
     """
     with on_all_ranks(comm, lambda: _open_checked(Path(path), kind), ProductError) as file:
         yield file
@@ -114,7 +114,7 @@ def find_group(file: h5py.Group, name: str) -> h5py.Group:
 
 
 def stored_numbers(file: h5py.File) -> Iterator[tuple[str, int | None, np.ndarray]]:
-    """Place, frame and values of all floating-point numbers of an open product; of a series only the last frame."""
+    """Place, frame and values of all floating-point numbers of an open product; of a series, only the last frame."""
     names: list[str] = []
     file.visit(names.append)
     for name in names:
@@ -171,15 +171,15 @@ def write_block(dataset: h5py.Dataset, block: np.ndarray, offset: tuple[int, ...
 def read_frame(dataset: h5py.Dataset, frame: int, selection: tuple[slice, ...], limit: float = np.inf) -> np.ndarray:
     """A part of a frame of floating-point numbers.
 
-    ProductError, on this rank, if a number is not finite, or not between 0 and a given `limit`. A rollout may end with
-    numbers that are not finite.
+    ProductError, on this rank, if a number is outside the range 0 to a given `limit`, or is not finite. Only a rollout
+    may end with numbers that are not finite.
     """
     values, kind = dataset[frame, *selection], dataset.file.attrs["kind"]
     place = f"frame {frame % len(dataset)}: holds values that are"
     if kind != "rollout" and not np.isfinite(values).all():
         raise unfit(dataset, f"{place} not finite")
     if limit < np.inf and np.any((values < 0) | (values > limit)):
-        raise unfit(dataset, f"{place} outside of 0 to {limit:.6g}")
+        raise unfit(dataset, f"{place} outside the range 0 to {limit:.6g}")
     return values
 
 
@@ -192,7 +192,7 @@ def read_times(dataset: h5py.Dataset) -> np.ndarray:
 
 
 def unfit(dataset: h5py.Dataset, problem: str) -> ProductError:
-    """The error of a dataset that no stage writes like this."""
+    """The error for a dataset with content that no stage writes."""
     return ProductError(f"{dataset.file.filename}: {dataset.name}, {problem}; {make_again(dataset.file.attrs['kind'])}")
 
 
@@ -218,7 +218,7 @@ def _open_checked(path: Path, kind: str | None) -> h5py.File:
 
 
 def _problem(file: h5py.File, kind: str | None, remedy: str) -> str | None:
-    """Why an open file is no product of a kind, with the remedy; None if it is one."""
+    """Why an open file is not a complete product of a kind, with the remedy; None if it is one."""
     try:
         stored, complete = str(file.attrs.get("kind", "unknown")), bool(file.attrs.get("complete", False))
     except (OSError, TypeError, ValueError) as error:

@@ -21,7 +21,7 @@ from eddies.io.new_files import create_export, write_files
 from eddies.io.trajectories import Trajectory
 
 SPLITS = ("train", "valid", "test")
-FRAMES_OF_A_SPLIT = 3  # the least number, which an acceleration needs
+FRAMES_OF_A_SPLIT = 3  # at least: an acceleration needs three frames
 FLUID = 0  # the type of all particles
 CONNECTIVITY = 1.45  # radius of pairs in the data sets of LagrangeBench, in mean distances between particles
 SMALLEST_DEVIATION = 1e-7  # a smaller standard deviation is stored as 1: the reader divides by it
@@ -37,18 +37,18 @@ def shortcoming(trajectory: Trajectory) -> str | None:
     """Why a trajectory cannot become a data set; None if it can."""
     times = trajectory.times
     if min(split_frames(len(times))) < FRAMES_OF_A_SPLIT:
-        return f"it has {len(times)} frames, too few for three parts with {FRAMES_OF_A_SPLIT} each"
+        return f"it has {len(times)} frames, too few for three parts of at least {FRAMES_OF_A_SPLIT}"
     intervals = np.diff(times)
     if not np.allclose(intervals, intervals.mean(), rtol=1e-6, atol=0):
-        return "its frames do not follow each other at equal intervals"
+        return "its frames are not at equal intervals"
     if not np.isfinite(trajectory.read(len(times) - 1, "position")).all():
         return "it ends with positions that are not finite"
     return None
 
 
 def write_dataset(directory: Path, trajectory: Trajectory, case: str, provenance: Mapping[str, Any]) -> None:
-    """Write a data set, named `case` in its metadata, of three consecutive parts of a trajectory without `shortcoming`;
-    on one rank. ProductError if a file cannot be written; existing files are then unchanged.
+    """Write three consecutive parts of a trajectory without `shortcoming` as a data set; on one rank. Its metadata name
+    it `case`. ProductError if a file cannot be written; existing files are then unchanged.
     """
     total, start, moments = trajectory.total, 0, []
     lengths = split_frames(len(trajectory.times))
@@ -85,7 +85,7 @@ def _copy_frames(trajectory: Trajectory, start: int, positions: h5py.Dataset) ->
 
 
 def _statistics(moments: np.ndarray) -> dict[str, list[float]]:
-    """Mean and standard deviation of velocity and acceleration from moments (parts, 2, 2, 3), averaged over parts."""
+    """Mean and standard deviation of velocity and acceleration from the moments (parts, 2, 2, 3) of `_copy_frames`."""
     statistics = {}
     for name, (mean, square) in zip(("vel", "acc"), moments.mean(axis=0)):
         deviation = np.sqrt(np.maximum(square - mean**2, 0))

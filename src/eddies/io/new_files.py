@@ -7,13 +7,13 @@ leaves the former file as it was. There are two ways to write:
 - `new_file`: an HDF5 file, by all ranks together; `create_export` is a short form for files of other programs.
 
 HDF5 does not survive a write that fails: it crashes when it closes the file, or ranks wait for each other for ever.
-Two measures answer this, and a third serves an h5py that is built without MPI, as its wheels are:
+Two measures prevent this, and a third is for an h5py that is built without MPI, as the wheels of h5py are:
 
 1. Each write is announced by `writing`, which reserves the space on the disk first. If there is too little, all ranks
    raise WriteError before HDF5 writes; the file can then be closed and removed. A margin stays reserved for what HDF5
    writes at the end.
-2. If a write fails nevertheless, or a rank of several raises an exception that the others may not know of, the file is
-   left open, as NAME.partial, and the job is aborted.
+2. If a write fails nevertheless, or one of several ranks raises an exception that the others may not know of, the file
+   is left open, as NAME.partial, and the job is aborted.
 3. Without MPI in h5py, rank 0 writes for all: `own_part` sends it the blocks of the other ranks. These have a file in
    memory with the same groups, attributes and shapes, so callers see no difference.
 
@@ -53,16 +53,16 @@ REMEDY = ("run on one rank, or build h5py with MPI: `CC=mpicc HDF5_MPI=ON pip in
 
 Layout = Mapping[str, tuple[tuple[int, ...], Any]]  # shape and type of each large dataset
 
-# The files that are being written, by the name that HDF5 has for them.
+# The files that are being written, by their names in HDF5.
 _open: dict[str, _NewFile] = {}
 # Files left open after an error, until the process ends: HDF5 would crash, or one rank would wait for the others.
 _abandoned: list[_NewFile] = []
 
 
 def write_files(contents: Mapping[Path, bytes | str]) -> None:
-    """Write small files on one rank. All get their names after all have been written.
+    """Write small files on one rank. They get their names after all of them have been written.
 
-    Raises WriteError; files that were there are then unchanged.
+    Raises WriteError if a file cannot be written or renamed. Existing files are unchanged if one cannot be written.
     """
     partials = {path: path.with_name(path.name + ".partial") for path in contents}
     whole = {path: content.encode() if isinstance(content, str) else content for path, content in contents.items()}
@@ -94,7 +94,7 @@ def new_file(comm: MPI.Comm, path: Path, checksums: bool = True) -> Iterator[h5p
         with file_errors(path):
             if checksums and on_first_rank(comm, new.is_own):
                 add_checksums(comm, new.path)
-                on_all_ranks(comm, lambda: _force_to_disk(new.path))  # of every node
+                on_all_ranks(comm, lambda: _force_to_disk(new.path))  # on every node
     except BaseException as error:
         _open.pop(new.name, None)
         if new.broken or comm.size > 1 and not isinstance(error, Stopped | WriteError | RunTakenOver):
@@ -114,8 +114,8 @@ def new_file(comm: MPI.Comm, path: Path, checksums: bool = True) -> Iterator[h5p
 def create_export(path: Path, layout: Layout, provenance: Mapping[str, Any], overhead: int = 0) -> Iterator[h5py.File]:
     """Write an HDF5 file for other programs, on one rank. It has empty datasets and the provenance of a product.
 
-    All space is reserved at the beginning: for the datasets and `overhead` bytes of others. The directory is made if it
-    is missing. Raises WriteError.
+    All space is reserved at the beginning: for the datasets, and `overhead` bytes for the rest. The directory is made
+    if it is missing. Raises WriteError.
     """
     with file_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -159,7 +159,7 @@ def has_single_writer(comm: MPI.Comm) -> bool:
 def own_part(group: h5py.Group | h5py.Dataset, shape: tuple[int, ...], block: np.ndarray,
              offset: tuple[int, ...]) -> tuple[np.ndarray, tuple[int, ...]]:
     """The part of an array that this rank writes, and its offset: its block or, if rank 0 writes for all, the whole
-    array of this `shape` on rank 0 and nothing on the others; collective."""
+    array of this `shape` on rank 0 and an empty one on the others; collective."""
     comm = _open[group.file.filename].comm
     if not has_single_writer(comm) or not shape:
         return block, offset
@@ -189,8 +189,8 @@ def frame_bytes(dataset: h5py.Dataset) -> int:
 
 
 class _NewFile:
-    """An HDF5 file that all ranks write together. `reserve` and both ways to close are collective; rank 0 calls the
-    others."""
+    """An HDF5 file that all ranks write together. `reserve`, `close` and `try_to_close` are collective; only rank 0
+    calls the other methods."""
 
     def __init__(self, comm: MPI.Comm, path: Path) -> None:
         self.comm, self.path, self.broken = comm, path, False
@@ -202,7 +202,7 @@ class _NewFile:
         _open[self.name] = self
 
     def reserve(self, size: int) -> None:
-        """Reserve space for `size` more bytes, beside those of earlier calls. WriteError on all ranks."""
+        """Reserve space for `size` more bytes than earlier calls. WriteError, on all ranks, if there is too little."""
         self._needed += size
         if self._needed + MARGIN_BYTES > self._reserved:
             stop = self._needed + 2 * MARGIN_BYTES
@@ -217,7 +217,7 @@ class _NewFile:
             self._stream.close()
 
     def try_to_close(self) -> bool:
-        """Close the file after an error, which stays the one that is raised. Returns whether all ranks could."""
+        """Close the file after an error, without raising another one. Returns whether all ranks have closed it."""
         complaint = None
         try:
             self.close()
@@ -261,7 +261,7 @@ class _NewFile:
         if self.comm.size > 1 and not has_single_writer(self.comm):
             self.file = h5py.File(self.path, "r+", driver="mpio", comm=self.comm)
         elif self.comm.rank == 0:
-            # Through Python's file, HDF5 takes no file lock, which some network file systems do not have.
+            # With a file object of Python, HDF5 uses no file lock, which some network file systems lack.
             self._stream = open(self.path, "r+b")
             self.file = h5py.File(self._stream, "r+")
         else:
@@ -280,7 +280,7 @@ class _NewFile:
                         raise
 
     def _alike(self, work: Callable[[], None]) -> None:
-        """Do work that may fail on some ranks. All ranks raise the WriteError of the lowest of them."""
+        """Do work that may fail on some ranks. All ranks raise the WriteError of the lowest rank that failed."""
         def guarded() -> None:
             with file_errors(self.path, self._needed + 2 * MARGIN_BYTES - self._reserved):
                 work()

@@ -20,8 +20,8 @@ from eddies.io.errors import ProductError
 from eddies.kernels.library import in_use
 from eddies.pipeline import MAKER_OF
 
-# The format of products; other formats are not read. Format 1 (eddies 0.1) is not stored in the file. Since 2 the
-# scales are those at the release, and a model is a list of terms. Since 3 the filter width has its own name.
+# The format of products; other formats are not read. Format 1 (eddies 0.1) is not stored in the file. Since format
+# 2, scales are those at the release, and a model is a list of terms. Since format 3, the filter width has its own name.
 FORMAT = 3
 LIBRARIES = ("numpy", "mpi4py", "h5py", "pyfftw", "torch")
 
@@ -34,7 +34,7 @@ def environment(ranks: int) -> dict[str, object]:
 
 @functools.cache  # it reads long files of the installation
 def versions() -> dict[str, str]:
-    """Versions of the libraries that this process has loaded."""
+    """Versions of Python, HDF5, MPI and the installed libraries."""
     found = {"python": platform.python_version(), "hdf5": h5py.version.hdf5_version,
              "mpi": MPI.Get_library_version().strip("\0 \n").split("\n")[0]}
     for library in LIBRARIES:
@@ -46,7 +46,7 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str | None:
-    """The git commit of the checkout that this package runs from, or None. It starts no process, which MPI dislikes."""
+    """The git commit of the checkout that this package runs from, or None. No process is started: MPI may forbid it."""
     git = Path(eddies.__file__).parents[2] / ".git"
     try:
         head = (git / "HEAD").read_text().strip()
@@ -83,8 +83,8 @@ def product_fingerprint(path: str | Path) -> str | None:
 
 
 def others_trained_on(origin: Mapping[str, Any]) -> list[str]:
-    """The ground truths that a model was trained on, if its own run's is not among them; `origin` is the model's
-    provenance."""
+    """The ground truths that a model was trained on; empty if that of its own run is among them. `origin` is the
+    model's provenance."""
     truths = origin.get("truths", {})
     return [] if origin.get("made_from", {}).get("ground_truth") in truths.values() else list(truths)
 
@@ -126,12 +126,12 @@ def _read_sound(path: str | Path, read: Callable[[h5py.File], dict[str, Any]]) -
 
 
 def _damaged(file: h5py.File, name: str) -> ProductError:
-    return ProductError(f"{file.filename}: its attribute {name} is not what was written, the file is damaged; make it "
+    return ProductError(f"{file.filename}: its attribute {name} is missing or not valid, the file is damaged; make it "
                         "again")
 
 
 def read_metrics(path: Path) -> dict[str, Any]:
-    """The numbers of a report by section. Raises ProductError if the file is damaged."""
+    """The numbers of a report, by section. Raises ProductError if the file is damaged."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except ValueError:

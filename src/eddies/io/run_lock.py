@@ -33,7 +33,7 @@ log = logging.getLogger("eddies")
 LOCK = "LOCK"
 SIGN_SECONDS = 30.0
 STALE_SECONDS = 300.0  # ten missed signs of life, as on a file system that hangs for a while
-SETTLE_SECONDS = 0.5  # in which other jobs that have found the same stale lock replace it, too
+SETTLE_SECONDS = 0.5  # time for other jobs that have found the same stale lock to replace it, too
 UNREADABLE = "unknown"
 
 
@@ -42,24 +42,24 @@ class RunInUse(UserError):
 
 
 class RunTakenOver(UserError):
-    """Another job has taken the run directory of this job over; raised on all ranks."""
+    """Another job has taken over the run directory of this job; raised on all ranks."""
 
     def __init__(self, path: Path, by: str = "") -> None:
-        super().__init__(f"{path}: another job has taken this run directory over{by}; this job ends and leaves all "
+        super().__init__(f"{path}: another job has taken over this run directory{by}; this job ends and leaves all "
                          "files as they are")
 
 
 @dataclass(frozen=True)
 class Holder:
-    """The job in a run directory, and its first rank."""
+    """The job that holds a run directory, and the process of its first rank."""
 
     job: str  # a unique name
     host: str
-    machine: str  # the boot of the machine and the process namespace; empty if unknown
+    machine: str  # boot id of the machine, and process namespace; empty if unknown
     pid: int
-    born: str  # start time of the process, in units of its machine; empty if unknown
+    born: str  # start time of the process, in clock ticks since the boot; empty if unknown
     batch: str  # number of the Slurm job, or empty
-    restarts: int  # how often Slurm has queued this job again
+    restarts: int  # how often Slurm has requeued this job
     start: str  # when the job took the directory, UTC
 
     @classmethod
@@ -71,9 +71,9 @@ class Holder:
                    datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"))
 
     def lives(self) -> bool | None:
-        """Whether the job still runs; None if this machine cannot know.
+        """Whether the job still runs; None if that cannot be known here.
 
-        The machine on which the job runs can know. A requeued Slurm job knows that its earlier run has ended.
+        It is known on the machine of the job. A requeued Slurm job also knows that its earlier run has ended.
         """
         own = self.this_job()
         if self.batch and self.batch == own.batch and self.restarts < own.restarts:
@@ -88,7 +88,7 @@ class Holder:
         except PermissionError:  # a process of another user, which /proc may hide
             if not born:
                 return True
-        return born == self.born if self.born else None  # its number may belong to another process by now
+        return born == self.born if self.born else None  # the pid may belong to another process by now
 
     def __str__(self) -> str:
         return f"process {self.pid} on {self.host}, since {self.start}"
@@ -127,11 +127,11 @@ class RunLock:
         self._signs.start()
 
     def loss(self) -> RunTakenOver | None:
-        """The error to raise after another job has taken the directory over; looks at most once a second."""
+        """The error to raise if another job has taken over the directory, else None. Looks at most once a second."""
         now = time.monotonic()
         if self._lost is None and now >= self._look_at:
             self._look_at = now + LOOK_SECONDS
-            with contextlib.suppress(OSError):  # a file system that hangs: nothing is known
+            with contextlib.suppress(OSError):  # the file system fails for a while: nothing is known
                 found = find_lock(self.directory)
                 if found is None:
                     self._lost = RunTakenOver(self.directory, ", or has removed its LOCK")
@@ -151,7 +151,7 @@ class RunLock:
 
     def _give_signs(self) -> None:
         while not self._ended.wait(SIGN_SECONDS):
-            with contextlib.suppress(OSError):  # a file system that hangs; the next sign may succeed
+            with contextlib.suppress(OSError):  # the file system fails for a while; the next sign may succeed
                 if _is_held_by(self.path, self.holder):
                     os.utime(self.path)
 
@@ -160,7 +160,7 @@ class RunLock:
 def lock_directory(comm: MPI.Comm, directory: Path, take_over: bool = False) -> Iterator[Loss]:
     """Hold a run directory, which is made if it is missing; collective. Yields `RunLock.loss` of rank 0.
 
-    A stale lock is replaced. With `take_over` every lock is replaced; its job ends at its next step.
+    A stale lock is replaced. With `take_over`, any lock is replaced; its job then ends at its next step.
 
     Raises:
         RunInUse: another job works there.
@@ -198,7 +198,7 @@ def find_lock(directory: Path) -> FoundLock | None:
 def _refuse(directory: Path, found: FoundLock | None) -> None:
     if found is not None and not found.stale:
         raise RunInUse(f"{directory}: another job works here ({found.holder}; its last sign of life was "
-                       f"{duration(max(found.silent, 0))} ago); wait until it ends, end it by a file STOP there, or "
+                       f"{duration(max(found.silent, 0))} ago); wait until it ends, stop it by a file STOP there, or "
                        "choose another --output; if the job has died, add --take-over")
 
 
@@ -222,9 +222,9 @@ def _take(directory: Path, take_over: bool) -> RunLock:
         time.sleep(SETTLE_SECONDS)
     if not _is_held_by(path, holder):
         _refuse(directory, find_lock(directory))
-        raise RunInUse(f"{directory}: another job has just been here; run the command again")
+        raise RunInUse(f"{directory}: another job has just used this directory; run the command again")
     if found is not None:
-        log.warning("%s: takes over from a job that %s (%s)", directory,
+        log.warning("%s: this job takes over from a job that %s (%s)", directory,
                     "has ended" if found.holder.lives() is False else
                     "has given no sign of life" if found.stale else "may still work there", found.holder)
     return RunLock(directory, holder, made)
@@ -265,7 +265,7 @@ def _read(path: Path) -> Holder:
 
 
 def _machine() -> str:
-    """The boot of this machine and the process namespace, as of a container; empty if unknown."""
+    """Boot id of this machine, and process namespace, which differs between containers; empty if unknown."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip() + " " + os.readlink("/proc/self/ns/pid")
     except OSError:

@@ -33,7 +33,7 @@ from eddies.io.trajectories import ROUNDING, write_h5md_header
 AXES = ("x", "y", "z")
 FILL = -1  # the id of a row without a particle
 MOST_ID = 2**53  # larger ids are not exact in double precision
-MOST_OFF = 2.0  # factor between displacements and velocities times intervals that no flow explains
+MOST_OFF = 2.0  # a larger factor between displacement and velocity * interval is an error of the units
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Tracks:
     ----------
     time : (rows,). track : id of the track, (rows,).
     position, velocity : (rows, 3). density : (rows,). Velocity and density are None if they were not measured.
-    edge : of the periodic cube, if the file has one.
+    edge : of the periodic cube; None: the file has none.
     """
 
     time: np.ndarray
@@ -56,12 +56,12 @@ class Tracks:
 
     @property
     def columns(self) -> dict[str, np.ndarray]:
-        """The columns that there are, by name."""
+        """The columns that were measured, by name."""
         found = {name: getattr(self, name) for name in ("time", "track", "position", "velocity", "density")}
         return {name: values for name, values in found.items() if values is not None}
 
     def chosen(self, rows: np.ndarray) -> Tracks:
-        """Some rows, by number or mask."""
+        """The tracks at some rows, given by number or mask."""
         return replace(self, **{name: values[rows] for name, values in self.columns.items()})
 
     @cached_property
@@ -77,7 +77,7 @@ class Tracks:
     def displacements(self, edge: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pairs of successive rows of a track: first rows (m,), displacements (m, 3) and intervals (m,).
 
-        Displacements are those to the nearest image in a periodic cube with this edge; None: there are no images.
+        In a periodic cube with this edge, displacements lead to the nearest image; None: no periodic cube.
         """
         order = np.lexsort((self.time, self.track))
         same = self.track[order[1:]] == self.track[order[:-1]]
@@ -99,8 +99,8 @@ def read_tracks(path: str | Path, layout: str | None = None, group: str | None =
     interval : time between frames, for an NPZ file without times.
 
     Raises:
-        ProductError: the file cannot be read, is no such file, or holds tracks that are not finite, incomplete, or
-            twice at one time.
+        ProductError: the file is missing or cannot be read, has another layout, or holds tracks that are not finite or
+            incomplete, or a track twice at one time.
     """
     path = Path(path)
     if not path.is_file():
@@ -128,8 +128,8 @@ def write_tracks(path: str | Path, times: Any, ids: Any, positions: Any, velocit
     edge : of the periodic cube.
 
     Raises:
-        ProductError: rows are not finite, are of unequal number, or have the same track twice at one time; or the file
-            cannot be written.
+        ProductError: a value is not finite, the arrays have different numbers of rows, a track appears twice at one
+            time, or the file cannot be written.
     """
     path = Path(path)
     columns = {"time": np.asarray(times, float), "track": np.asarray(ids), "position": np.asarray(positions, float),
@@ -159,7 +159,7 @@ def write_tracks(path: str | Path, times: Any, ids: Any, positions: Any, velocit
 
 
 def _layout_of(path: Path) -> str:
-    """The layout of a file by its suffix; an HDF5 file without /h5md is one of LagrangeBench."""
+    """The layout of a file by its suffix; an HDF5 file without /particles is one of LagrangeBench."""
     suffix = path.suffix.lower()
     if suffix in (".h5", ".hdf5", ".h5md"):
         with _opened(path) as file:
@@ -168,7 +168,7 @@ def _layout_of(path: Path) -> str:
         return "npz"
     if suffix in (".csv", ".txt", ".dat", ".tsv"):
         return "csv"
-    raise ProductError(f"{path}: the layout does not follow from the suffix; give one of {', '.join(LAYOUTS)}")
+    raise ProductError(f"{path}: the suffix does not show the layout; give layout, one of {', '.join(LAYOUTS)}")
 
 
 def _read_h5md(path: Path, group: str | None, interval: float | None) -> Tracks:
@@ -239,7 +239,7 @@ def _read_csv(path: Path, group: str | None, interval: float | None) -> Tracks:
 
 LAYOUTS: Mapping[str, Callable[[Path, str | None, float | None], Tracks]] = {
     "h5md": _read_h5md, "npz": _read_npz, "lagrangebench": _read_lagrangebench, "csv": _read_csv}
-# What numpy, h5py and json raise of a file with other content.
+# Errors of numpy, h5py and json for a file with other content.
 UNREADABLE = (KeyError, ValueError, TypeError, IndexError, AttributeError, EOFError, BadZipFile, zlib.error)
 
 
@@ -252,7 +252,7 @@ def _opened(path: Path) -> h5py.File:
 
 
 def _chosen(path: Path, holder: Mapping[str, Any], name: str | None, what: str) -> Any:
-    """The only group of a holder, or the one with a name."""
+    """The group with this name; None: the only group."""
     if name is None and len(holder) == 1:
         return next(iter(holder.values()))
     if name is not None and name in holder:
@@ -284,14 +284,14 @@ def _from_frames(times: np.ndarray, ids: np.ndarray, position: np.ndarray, veloc
 
 
 def checked(tracks: Tracks, path: Path) -> Tracks:
-    """The tracks sorted by time and id, with ids of 64 bits. Raises ProductError for rows that are none."""
+    """The tracks sorted by time and id, with ids of 64 bits. ProductError if there is no row, or a row is not valid."""
     rows = len(tracks.time)
     if not rows:
         raise ProductError(f"{path}: holds no particles")
     for name, values in tracks.columns.items():
         shape = (rows, 3) if name in ("position", "velocity") else (rows,)
         if values.shape != shape:
-            raise ProductError(f"{path}: {name} has the shape {values.shape}, and {rows} times need {shape}")
+            raise ProductError(f"{path}: {name} has the shape {values.shape}, but {rows} times need {shape}")
         bad = np.flatnonzero(~np.isfinite(values).reshape(rows, -1).all(1))
         if len(bad):
             raise ProductError(f"{path}: {name} of track {tracks.track[bad[0]]} at time {tracks.time[bad[0]]:g} is not "
@@ -299,19 +299,19 @@ def checked(tracks: Tracks, path: Path) -> Tracks:
     bad = np.flatnonzero((tracks.track != np.rint(tracks.track)) | (tracks.track < 0) | (tracks.track >= MOST_ID))
     if len(bad):
         raise ProductError(f"{path}: track {tracks.track[bad[0]]} at time {tracks.time[bad[0]]:g}: ids must be whole "
-                           f"numbers from 0 to 2^53 ({len(bad)} such rows); number the tracks so")
+                           f"numbers from 0 to 2^53 ({len(bad)} such rows); number the tracks again")
     tracks = replace(tracks, track=tracks.track.astype(np.int64))
     sorted_tracks = tracks.chosen(np.lexsort((tracks.track, tracks.time)))
     time, track = sorted_tracks.time, sorted_tracks.track
     twice = np.flatnonzero((np.diff(time) == 0) & (np.diff(track) == 0))
     if len(twice):
-        raise ProductError(f"{path}: track {track[twice[0]]} is there twice at time {time[twice[0]]:g} ({len(twice)} "
+        raise ProductError(f"{path}: track {track[twice[0]]} appears twice at time {time[twice[0]]:g} ({len(twice)} "
                            "such rows); give each particle an id of its own")
     return sorted_tracks
 
 
 def check_inside(tracks: Tracks, lower: np.ndarray, upper: np.ndarray, key: str, path: str | Path) -> None:
-    """Raise ProductError for positions outside the box or volume that a key gives: the unit of length is another."""
+    """Raise ProductError if positions are outside the box or volume that a key gives: the unit of length is wrong."""
     margin = ROUNDING * (upper - lower)
     outside = np.flatnonzero(((tracks.position < lower - margin) | (tracks.position > upper + margin)).any(1))
     if len(outside):
@@ -323,8 +323,8 @@ def check_inside(tracks: Tracks, lower: np.ndarray, upper: np.ndarray, key: str,
 
 
 def check_velocities(tracks: Tracks, edge: float | None, path: str | Path) -> None:
-    """Raise ProductError for velocities that contradict displacements, in a periodic cube with this edge or in none:
-    lengths or times have another unit than the file is said to have."""
+    """Raise ProductError if velocities contradict displacements: the unit of length or time is wrong. `edge` is that
+    of the periodic cube, or None."""
     if tracks.velocity is None:
         return
     first, moved, interval = tracks.displacements(edge)

@@ -1,8 +1,8 @@
 """Particle trajectories in the H5MD 1.1 layout (de Buyl, Colberg & Höfling, Comput. Phys. Commun. 185, 1546).
 
 Row k of every frame belongs to the particle with id k, so frames can be compared without sorting. The box has edges for
-every frame, and the attribute `unit` names units of molecules for L, T and L/T, for readers such as MDAnalysis, which
-accept no others.
+every frame. The attribute `unit` names molecular units for L, T and L/T, because readers such as MDAnalysis accept no
+others.
 """
 
 from collections.abc import Mapping
@@ -17,11 +17,11 @@ from eddies.io.hdf5 import (append_frame, find_group, growing_dataset, read_fram
 
 IMAGE = "image"
 UNITS = {"position": "Angstrom", "velocity": "Angstrom ps-1"}
-ROUNDING = 1e-6  # of positions in single precision
+ROUNDING = 1e-6  # relative, of positions in single precision
 
 
 class TrajectoryWriter:
-    """Adds frames of `total` particles to /particles/NAME. Making one and every `append` are collective.
+    """Adds frames of `total` particles to /particles/NAME. The constructor and every `append` are collective.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class TrajectoryWriter:
             self._columns[IMAGE] = self._element(IMAGE, (total, 3), np.int16)
 
     def append(self, step: int, time: float, start: int, columns: Mapping[str, np.ndarray]) -> None:
-        """Add a frame: this rank holds rows start, start + 1, ... of every column, by id; maybe none."""
+        """Add a frame: this rank holds rows start, start + 1, ... of every column, by id, or no row."""
         append_frame(self._step, np.array(step), ())
         append_frame(self._time, np.array(time), ())
         append_frame(self._edges, np.diag([self._length] * 3), (0, 0))
@@ -113,9 +113,9 @@ class Trajectory:
         return self._group["step"][()]
 
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Rows start to stop of a column at a frame, (stop - start, ...), in order of id.
+        """Rows start, ..., stop - 1 of a column at a frame, (stop - start, ...), in order of id.
 
-        Raises ProductError if a number is not finite, or a position is outside of the cube.
+        Raises ProductError if a number is not finite, or a position is outside the cube.
         """
         rows, ids = slice(start, stop), self._group["id"]
         if (start, stop) not in self._in_order:
@@ -127,7 +127,7 @@ class Trajectory:
 
 
 def write_h5md_header(file: h5py.File) -> None:
-    """Write the group /h5md, unless it is there."""
+    """Write the group /h5md, unless it exists."""
     if "h5md" in file:
         return
     header = file.create_group("h5md")

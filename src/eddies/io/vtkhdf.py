@@ -21,17 +21,16 @@ from eddies.io.trajectories import Trajectory
 
 VERSION = (2, 0)
 BLOCK_BYTES = 2**26  # of a field in memory at once
-STEP_BYTES = 2**10  # an upper limit of what a step takes beside the large datasets
+STEP_BYTES = 2**10  # upper limit of the bytes of a step outside the large datasets
 
 
 def write_images(path: Path, series: FieldSeries, length: float, corner: np.ndarray,
                  provenance: Mapping[str, Any]) -> None:
     """Write a series of fields in a cube of edge `length` as ImageData, a step for each frame; on one rank.
 
-    `corner` (3,) is the place of the first point.
-
-    The values are point data. The plane at L, equal to that at 0 by periodicity, is added along each axis, so that the
-    (cells + 1)^3 points span the whole cube. ProductError if the file cannot be written.
+    The first point is at `corner` (3,). The values are point data. The plane at L, equal to that at 0 by periodicity,
+    is added along each axis, so that the (cells + 1)^3 points span the whole cube. ProductError if the file cannot be
+    written.
     """
     cells, frames, layout = series.cells, len(series.times), {}
     for variable in series.variables:
@@ -80,7 +79,7 @@ def _create(path: Path, kind: str, frames: int, layout: Layout,
     within = {f"VTKHDF/{name}": dataset for name, dataset in layout.items()}
     with create_export(path, within, provenance, STEP_BYTES * frames) as file:
         root = file["VTKHDF"]
-        # The reader wants the type as a string of fixed length.
+        # The reader needs the type as a string of fixed length.
         write_attributes(root, {"Version": np.array(VERSION), "Type": np.bytes_(kind)})
         yield root
 
@@ -97,7 +96,7 @@ def _write_steps(root: h5py.Group, times: np.ndarray, offsets: Mapping[str, np.n
 
 
 def _copy_field(series: FieldSeries, frame: int, variable: str, dataset: h5py.Dataset) -> None:
-    """Copy (components, z, y, x) to (z, y, x, components), closing the periodic cube."""
+    """Copy (components, z, y, x) to (z, y, x, components), and repeat the first planes at the end of each axis."""
     cells, frames = series.cells, len(series.times)
     step = () if frames == 1 else (frame,)
     blocks = math.ceil(dataset.nbytes / frames / BLOCK_BYTES)
@@ -132,5 +131,5 @@ def _point_offsets(frames: int, total: int, names: Iterable[str]) -> dict[str, n
 
 
 def _offsets_of(name: str) -> str:
-    """The dataset of a dataset's offsets, among the steps."""
+    """The name, in the group Steps, of the offsets of a dataset."""
     return "PointOffsets" if name == "Points" else name.replace("PointData/", "PointDataOffsets/")

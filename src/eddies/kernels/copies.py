@@ -1,8 +1,8 @@
-"""Copies around the one-dimensional passes of a slab transform.
+"""Copies before and after the one-dimensional passes of a slab transform.
 
 Along an axis of `cells` points a transform keeps the modes 0 ... K, -K ... -1, at both ends of its arrays. The gap
-between them stays zero. Arrays that are used many times are `described` once: numpy returns addresses slowly. They must
-be contiguous and of the given precision; ValueError otherwise.
+between them stays zero. Arrays that are used many times are `described` once, because numpy returns addresses slowly.
+They must be contiguous and of the given precision; ValueError otherwise.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ class PlaneCopies(_Copies):
             yield
 
     def unpack(self, rows: _Array, blocks: _Blocks, component: int, planes: slice) -> None:
-        """Copy twice the modes of some planes from the output of the transform along y to a component of blocks."""
+        """Copy the modes of some planes, times 2, from the output of the transform along y to a component of blocks."""
         self._unpack(ctypes.byref(blocks), component, planes.start, planes.stop - planes.start, self._cells,
                      rows.shape[-1], rows.address)
 

@@ -23,8 +23,8 @@ class _Modes(ctypes.Structure):
 class Formulas:
     """Formulas for fields (c, ...) at grid points and for modes (c, kz, ky, kx) with the given wavevectors.
 
-    Terms of a sum are pairs of factors (kz >= 0, ky, n, kx), equal for kz and -kz, and of a state. Arrays have the
-    grid's precision. Modes are contiguous; fields are contiguous each, at any distance. ValueError otherwise.
+    Terms of a sum are pairs (factors, state), where factors (kz >= 0, ky, n, kx) are equal for kz and -kz. Arrays must
+    have the grid's precision. Modes must be contiguous, and so must each field; ValueError otherwise.
     """
 
     def __init__(self, library: ctypes.CDLL, wavevector: Sequence[np.ndarray]) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from eddies.kernels.library import ADDRESS, INT, NUMBER, address, members, require
 
-# Neighbours of a receiver. With so many, the equations of a vector of receivers take 64 MB in single precision.
+# Most neighbours of a receiver. The equations of a vector of such receivers take 64 MB in single precision.
 MOST_NEIGHBORS = 1024
 
 
@@ -38,7 +38,7 @@ def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.
     support : distance beyond which a receiver has no neighbours.
     noise : variance of the part of a value that does not belong to the field.
     slowest, amplitudes : of the covariance sum_m amplitudes[m] exp(-slowest 2^m r^2), at most eight terms.
-    sited : whether receivers are particles, whose own values count.
+    sited : whether receivers are particles, so that their own values count.
     """
     dtype, pairs = displacement.dtype, displacement.shape[-1]
     offsets, amplitudes = np.ascontiguousarray(offsets, np.int64), np.ascontiguousarray(amplitudes, np.float64)

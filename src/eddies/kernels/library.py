@@ -17,7 +17,7 @@ from eddies.errors import UserError
 INT, NUMBER, ADDRESS = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 # The same as in setup.py. A processor that runs one of them also runs all before it.
 INSTRUCTION_SETS = ("plain", "avx2", "avx512")
-# Parameters of glibc's mallopt. At most 32 MiB are taken from kept memory; larger blocks are always mapped.
+# Parameters of glibc's mallopt. Blocks of up to 32 MiB are taken from kept memory; larger ones are always mapped.
 TRIM_THRESHOLD, TOP_PAD, MMAP_THRESHOLD = -1, -2, -3
 KEPT = {MMAP_THRESHOLD: 2**25, TRIM_THRESHOLD: 2**30, TOP_PAD: 2**28}
 REMEDY = ("install a C++ compiler (g++), then eddies again: `pip install --force-reinstall --no-deps .` in its sources "
@@ -25,7 +25,7 @@ REMEDY = ("install a C++ compiler (g++), then eddies again: `pip install --force
 
 
 class MissingLibraryError(UserError):
-    """The compiled library is missing, does not load, or was built from other sources than lie beside it."""
+    """The compiled library is missing, does not load, or was not built from the sources beside it."""
 
 
 @functools.cache
@@ -55,7 +55,7 @@ def in_use() -> str:
 def load(instruction_set: str) -> ctypes.CDLL:
     """The library for one instruction set.
 
-    Raises MissingLibraryError if it does not load, or if it was built from other sources than lie beside it: its
+    Raises MissingLibraryError if it does not load, or if it was not built from the sources beside it: its
     functions may then take other arguments.
     """
     share_threads()
@@ -78,8 +78,8 @@ def load(instruction_set: str) -> ctypes.CDLL:
 def share_threads() -> None:
     """Make kernels, and torch if it is loaded later, use the OpenMP runtime of pyfftw's wheel.
 
-    The threads of two runtimes wait for each other, spinning on the same cores: a step of the direct simulation took
-    twenty times as long.
+    Otherwise the threads of two runtimes wait for each other and spin on the same cores: a step of the direct
+    simulation took twenty times as long.
     """
     maps = Path("/proc/self/maps")
     if threads() == 1 or not maps.exists():
@@ -96,8 +96,8 @@ def share_threads() -> None:
 def keep_freed_memory() -> None:
     """Keep freed memory in this process instead of returning it to the system.
 
-    New pages took a sixth of a turnover of 32^3 particles with kriging. Does nothing if the user has set MALLOC_...
-    variables, or with a C library other than glibc.
+    Otherwise new pages took a sixth of the time of a turnover of 32^3 particles with kriging. Does nothing if the
+    user has set MALLOC_... variables, or with a C library other than glibc.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None or any(name.startswith("MALLOC_") for name in os.environ):

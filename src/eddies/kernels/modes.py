@@ -17,7 +17,7 @@ class _Weights(ctypes.Structure):
 class ModePasses:
     """The operations of one iteration on modes (3, kz, ky, kx).
 
-    Inner products of real fields are sums over modes, each counted by its `multiplicity`. Sums are over this rank.
+    Inner products of real fields are sums over the modes of this rank, each counted by its `multiplicity`.
 
     Parameters
     ----------

@@ -51,7 +51,8 @@ def pairs_within(library: ctypes.CDLL, box: Box, radius: float, receivers: np.nd
                  offsets: np.ndarray, listed: np.ndarray, rows: np.ndarray, kind: np.dtype) -> tuple[np.ndarray, ...]:
     """The pairs of a list that are within a radius now, for the receivers `rows` (k,).
 
-    Returns the rows of receiver, output and sender (m,), displacements to the nearest image (3, m), and distances (m,).
+    Returns for each pair the receiver, its place in `rows` and the sender (m,), the displacement to the nearest image
+    (3, m), and the distance (m,).
     """
     receivers, senders = (np.ascontiguousarray(points, np.float64) for points in (receivers, senders))
     rows, first = np.ascontiguousarray(rows, np.int64), np.empty(len(rows) + 1, np.int64)

@@ -15,7 +15,7 @@ FITS = {1: "fit_linear", 2: "fit_quadratic"}
 
 @dataclass(frozen=True)
 class GridPlanes:
-    """Planes `first` to `first + planes` of a grid with `cells`^2 points each, `spacing` apart."""
+    """Planes `first`, ..., `first + planes - 1` of a grid with `cells`^2 points each, `spacing` apart."""
 
     cells: int
     spacing: float
@@ -65,7 +65,7 @@ def sums_on_grid(library: ctypes.CDLL, grid: GridPlanes, numbers: tuple[float, .
 def fitted(library: ctypes.CDLL, box: Box, degree: int, numbers: tuple[float, ...], volume: float, ridge: float,
            offsets: np.ndarray, senders: np.ndarray, receivers: np.ndarray, positions: np.ndarray,
            values: np.ndarray) -> np.ndarray:
-    """Moving least squares: values and their derivatives along x, y and z, (n, 4, 3), of the best polynomials.
+    """Moving least squares: values and their derivatives along x, y and z, (n, 4, 3), of the fitted polynomials.
 
     `eddies.particles.particle_field.ParticleField.fitted` defines them. `numbers` are the weight W as `kernel_numbers`
     returns it, `volume` the mean volume of a particle. `offsets` (n + 1,) and `senders` (m,) are the particles listed

@@ -42,8 +42,8 @@ class _Cloud(ctypes.Structure):
 class Splines:
     """The (degree + 1)^3 tensor-product B-splines around points (n, 3), of degree 3 or 5.
 
-    x and y are periodic; z is periodic too, but must lie among the planes. The points are sorted once, here. Raises
-    MisplacedPoint.
+    x and y are periodic; z is periodic too, but the splines must lie within the planes. The points are sorted once,
+    here. Raises MisplacedPoint.
     """
 
     def __init__(self, library: ctypes.CDLL, degree: int, positions: np.ndarray, padded: PaddedPlanes) -> None:
@@ -66,7 +66,7 @@ class Splines:
         return values
 
     def slope(self, parts: Sequence[np.ndarray], factors: np.ndarray) -> np.ndarray:
-        """Gradient (n, 3) by the positions of sum_c factors_c f_c, at fixed factors (n, c)."""
+        """Gradient (n, 3), with respect to the positions, of sum_c factors_c f_c, at fixed factors (n, c)."""
         gradients = np.empty((self._cloud.points, 3))
         self._call("splines_slope", _contiguous(parts), np.ascontiguousarray(factors, np.float64), gradients)
         return gradients / self._padded.spacing

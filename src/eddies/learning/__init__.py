@@ -1,1 +1,1 @@
-"""Training on particles shared among ranks: losses are global, gradients are summed over ranks."""
+"""Training on particles distributed over ranks: losses are global, gradients are summed over ranks."""

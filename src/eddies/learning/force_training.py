@@ -29,7 +29,7 @@ HISTOGRAM_BINS, HISTOGRAM_REACH = 41, 5.0
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of the other losses; the trajectory loss has weight 1. The power loss is not part of Eq. 15."""
+    """Weights of the losses besides the trajectory loss, whose weight is 1. The power loss is not part of Eq. 15."""
 
     field: float = 0.0
     velocity_kl: float = 0.0
@@ -49,12 +49,12 @@ class KernelNeighborhood:
 
 @dataclass(frozen=True)
 class FieldLater:
-    """Particles and filtered flow one frame after a frame.
+    """Particles and filtered flow one frame after a frame of the training.
 
     Parameters
     ----------
-    position, velocity : (n, 3), in the rows of the frame's particles; positions are not wrapped into the box.
-    span : time from the frame before the frame to the frame after it.
+    position, velocity : (n, 3), rows as in the particles of that frame; positions are not wrapped into the box.
+    span : time from the frame before that frame to the frame after it.
     points, field : this rank's grid points (m, 3), and the filtered velocity (m, 3) there.
     """
 
@@ -66,7 +66,7 @@ class FieldLater:
 
 
 class TrainingFrame:
-    """The particles of one frame with their true rates, and the model's terms around them; collective.
+    """The particles of one frame with their true rates, and the model's terms at these particles; collective.
 
     Terms that are linear in their parameters are evaluated once, here.
 
@@ -110,7 +110,7 @@ class TrainingFrame:
         return velocity * (self.model.flow.scales.filter_width / self._rms(velocity)[0] ** 3)
 
     def rows(self, ids: np.ndarray) -> Tensor:
-        """Rows of the given particles, as far as this rank owns them."""
+        """Rows of those of the given particles that this rank owns."""
         wanted = torch.from_numpy(ids).to(self._sorted_ids.device)
         place = torch.searchsorted(self._sorted_ids, wanted)
         inside = place < len(self._sorted_ids)
@@ -130,7 +130,7 @@ class TrainingFrame:
         """
         if self._within is None or self._within.kernel is not kernel:
             around, averaged = self.dynamics.neighborhood, self.averaged
-            # The model's list serves if it reaches as far and belongs to the same positions.
+            # The model's list is used if it reaches as far and belongs to the same positions.
             if around is None or around.cutoff < kernel.support * (1 - 1e-9) or self.later is not None:
                 around = Neighborhood(self.decomposition, kernel.support, 0.0)
                 around.update(averaged)
@@ -142,7 +142,7 @@ class TrainingFrame:
     def errors(self, rows: Tensor | None = None, density: Tensor | None = None) -> dict[str, Tensor]:
         """Predicted minus true "acceleration" (k, 3) and, if the model has one, "density_rate" (k,); collective.
 
-        At all owned particles, or at some `rows`; with the density of the terms, or with another `density` (n,).
+        They are at all owned particles, or at `rows`, with the density that terms give, or with another `density` (n,).
         """
         chosen = slice(None) if rows is None else rows
         rates = self.dynamics.rates(self.particles, rows, self.kept, density)
@@ -167,10 +167,10 @@ class ForceTrainer:
 
     Parameters
     ----------
-    model, frames : the frames all on the same slabs.
-    kernel : of the field loss; None without that loss. Its grid has about as many points as there are particles, or is
-        the grid of the filtered field.
-    weights : of the losses. batch : particles of a step without the field loss.
+    model, frames : all frames are on the same slabs.
+    kernel : of the field loss; None without that loss. The grid of the loss has about as many points as there are
+        particles, or is the grid of the filtered field.
+    weights : of the losses. batch : number of particles in a step without the field loss.
     """
 
     def __init__(self, model: LagrangianModel, frames: Sequence[TrainingFrame], kernel: SmoothingKernel | None,
@@ -184,20 +184,20 @@ class ForceTrainer:
                         else later.points)
 
     def trajectory_step(self, optimizer: Adam, step: int) -> dict[str, float]:
-        """One step on the trajectory loss (Eq. 12), and on the power, of a random batch; returns the losses."""
+        """One step on the trajectory loss (Eq. 12) and the power loss of a random batch; returns the losses."""
         frame, random = self._drawn(step)
         rows = frame.rows(random.choice(self.total, self.batch, replace=False))
         return self._step(optimizer, self._one_step_shares(frame, rows, frame.errors(rows), self.batch))
 
     def combined_step(self, optimizer: Adam, step: int) -> dict[str, float]:
-        """One step on all losses, in a random cube with the field loss, else on a random batch; returns the losses."""
+        """One step on all losses, in a random cube if there is a field loss, else on a random batch; returns losses."""
         return self._step(optimizer, self._combined_shares(*self._drawn(step)))
 
     @torch.no_grad()
     def one_step_error(self, frame: TrainingFrame, most: int) -> float:
         """Normalised L2 error of the acceleration on a fixed sample of at most `most` particles of a frame; collective.
 
-        With a loss of the power, the root of the sum of its square and that weighted loss.
+        With a power loss it is the root of the sum of that squared error and the weighted power loss.
         """
         count = min(most, self.total)
         rows = frame.rows(np.random.default_rng(self.seed).choice(self.total, count, replace=False))
@@ -210,7 +210,7 @@ class ForceTrainer:
 
     @torch.no_grad()
     def combined_error(self, frame: TrainingFrame, draws: int) -> float:
-        """Root of the weighted sum of all losses on one frame, averaged over always the same draws; collective."""
+        """Root of the weighted sum of all losses on one frame, averaged over fixed random draws; collective."""
         shares = [self._weighted(self._combined_shares(frame, np.random.default_rng([self.seed, draw])))
                   for draw in range(draws)]
         return float(shared_values(self.comm, {"loss": sum(shares)})["loss"] / draws) ** 0.5
@@ -247,11 +247,11 @@ class ForceTrainer:
 
     def _one_step_shares(self, frame: TrainingFrame, rows: Tensor, errors: dict[str, Tensor],
                          count: int) -> dict[str, Tensor]:
-        """Shares of the losses without kernel and histograms, over `count` particles of all ranks.
+        """Shares of the losses that need no kernel and no histograms, over `count` particles of all ranks.
 
         The trajectory loss is Eq. 12 with centred differences. Each rate is in units of its rms at the time: all frames
-        of a decaying flow count alike. A rate of density counts unless one of its terms is learned through several
-        steps of the simulation.
+        of a decaying flow count alike. The density rate is part of this loss unless one of its terms is learned through
+        several steps of the simulation.
         """
         share = mean_square_share(errors["acceleration"], frame.acceleration_rms, count)
         if self.model.regresses_density:
@@ -279,9 +279,9 @@ class ForceTrainer:
 
         With a filtered field u one frame later, the error is (<v> - u) / span. v = v_before + span a is the model's
         velocity after a midpoint step of length span, from the frame before to the frame after. True accelerations are
-        centred differences, so v is the true velocity at its end plus span (a - a_true). The positions at its end do
-        not depend on a: they are the true ones. This error is therefore the one without a field, plus the kernel's
-        error for the true particles over span.
+        centred differences, so v is the true velocity at the end of the step plus span (a - a_true). The positions
+        there do not depend on a: they are the true ones. This error is therefore the one without a field, plus the
+        kernel's error for the true particles, divided by span.
         """
         within, later, points = frame.within(self.kernel), frame.later, self._points[inside]
         change = torch.zeros_like(frame.acceleration).index_add(0, rows, error)

@@ -40,7 +40,7 @@ class KernelSample:
         self.mean_square = self._mean_squares(self.field, self.gradient)
 
     def own_rows(self, points: np.ndarray) -> Tensor:
-        """Rows of the given points (numbers in the whole grid, z slowest), as far as they lie in this slab."""
+        """Rows of those of the given points (numbers in the whole grid, z slowest) that lie in this slab."""
         n = self.decomposition.planes
         own = points[(points // n**2 >= self.decomposition.start) & (points // n**2 < self.decomposition.stop)]
         return torch.from_numpy(own - self.decomposition.start * n**2)
@@ -56,7 +56,7 @@ class KernelSample:
 
 
 class KernelTrainer:
-    """Fits a kernel network to samples: the loss of Eq. 8 on random grid points of one of them at each step.
+    """Fits a kernel network to samples. Each step lowers the loss of Eq. 8 on random grid points of one sample.
 
     Points are drawn from (seed, step) alone, so that the loss is the same on any number of ranks.
     """

@@ -30,8 +30,8 @@ def relative_error(comm: Comm, error: Tensor, exact: Tensor) -> float:
 def soft_histogram(comm: Comm, values: Tensor, bins: int, reach: float) -> Tensor:
     """Differentiable global histogram (bins,) of values of any shape over [-reach, reach], of mass 1; collective.
 
-    Each value spreads its mass linearly over the two nearest bin centres. Values beyond the ends count at the ends. NaN
-    if a value is NaN.
+    Each value spreads its mass linearly over the two nearest bin centres. Values beyond the ends count at the ends. The
+    histogram is NaN if a value is NaN.
     """
     position = (values.flatten().clamp(-reach, reach) + reach) * ((bins - 1) / (2 * reach))
     lower = position.detach().nan_to_num().floor().clamp(max=bins - 2).long()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.optim.adam import adam  # not the class around it, which loads torch's compiler for two seconds
+from torch.optim.adam import adam  # not the class Adam, which loads torch's compiler and takes two seconds
 
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_sum, sum_flat

@@ -20,7 +20,7 @@ from eddies.particles.integrators import Integrator
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
 
-# A band's mean loss is at least this share of the largest one.
+# Smallest mean energy loss of a band, as a share of the largest one: smaller losses are raised to it.
 SLOWEST = 0.1
 
 
@@ -49,12 +49,12 @@ class RolloutTrainer:
     loss of frame k is <|v - v_true|^2> / <|v_true - v_start|^2>, 1 for particles without acceleration, so that all
     frames count alike. A density whose rate is learned has the same loss.
 
-    The energy loss is the mean over bands of wavenumbers of the squared error of their kinetic energy, over the mean
-    energy that the band loses in that time. Fitted forces are attenuated where their features are noisy: they take too
-    much energy from some scales and too little from others, which the error of the velocity hardly shows.
+    The energy loss is the mean over bands of wavenumbers of the squared error of the band's kinetic energy, in units of
+    the mean energy that it loses in that time. Fitted forces are attenuated where their features are noisy: they take
+    too much energy from some scales and too little from others, which the error of the velocity hardly shows.
 
     The gradient goes through all steps: force, neighbours, halo, and the grid of the resolved velocity. Each step is
-    computed again on the way back, so that memory holds one step.
+    computed again in the backward pass, so that memory holds one step.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ class RolloutTrainer:
         return sum(shared_values(self.comm, shares).values()) ** 0.5
 
     def _energy_share(self, window: TrainingWindow, frame: int, particles: ParticleSet) -> Tensor:
-        """This rank's equal part of the squared error of the energies by bands."""
+        """This rank's share, an equal part, of the mean squared error of the energies of the bands."""
         # The solve starts from zero, as for the truth: a prediction would change the energies. In the backward
         # pass it starts from its own solution and takes no iteration.
         near: Tensor | None = None
@@ -121,7 +121,7 @@ class RolloutTrainer:
         return ((energies - true) / (true * self.losses * (frame + 1))).square().mean() / self.comm.size
 
     def _frames(self, particles: ParticleSet, horizon: int) -> Iterator[tuple[int, ParticleSet]]:
-        """Number and particles of each frame reached."""
+        """Yield the number and the particles of each frame that the rollout reaches."""
         memory: dict[str, Tensor] = {}
         self.integrator.dynamics.begin()
         for reached in range(horizon):
@@ -136,7 +136,7 @@ class RolloutTrainer:
         del given["id"]
 
         def advance(*columns: Tensor) -> tuple[Tensor, ...]:
-            # New lists and the same forecasts, so that the way back repeats the step exactly.
+            # New lists and the same predictions, so that the backward pass repeats the step exactly.
             self.integrator.dynamics.forget()
             self.integrator.dynamics.load_state_dict(state)
             start = ParticleSet(particles.id, **dict(zip(given, columns)))
@@ -163,12 +163,12 @@ class RolloutTrainer:
         return float(np.sqrt(squares / (self.total * math.prod(true.shape[1:]))))
 
 
-# Its wrapper loads torch's compiler for two seconds.
+# The wrapper of `checkpoint` loads torch's compiler, which takes two seconds.
 UNWRAPPED = getattr(checkpoint, "__wrapped__", checkpoint)
 
 
 def mean_losses(windows: Sequence[TrainingWindow], stationary: bool = False) -> Tensor:
-    """Change of ln(energy) of each band per frame interval, (bands,): mean over windows, or rms if `stationary`."""
+    """Size of the change of ln(energy) of each band per frame, (bands,): mean over windows, or rms if `stationary`."""
     changes = torch.stack([window.energies[-1] / window.energies[0] for window in windows]).log()
     change = changes.square().mean(0).sqrt() if stationary else changes.mean(0)
     losses = (change / (len(windows[0].energies) - 1)).abs()
@@ -176,7 +176,7 @@ def mean_losses(windows: Sequence[TrainingWindow], stationary: bool = False) -> 
 
 
 def _recomputed(function: Callable[..., Any], *columns: Tensor) -> Any:
-    """The result of a function that is called again for the gradient, instead of keeping its intermediate results."""
+    """The result of a function. Its intermediate results are not kept: it is called again for the gradient."""
     if not torch.is_grad_enabled():
         return function(*columns)
     return UNWRAPPED(function, *columns, use_reentrant=False, preserve_rng_state=False)

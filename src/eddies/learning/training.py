@@ -18,7 +18,7 @@ from eddies.parallel.halo import HaloError
 
 @dataclass(frozen=True)
 class Phase:
-    """Steps with one fall of the learning rate and one validation error.
+    """Steps of a training with one decay of the learning rate and one measure of the validation error.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class Phase:
 
 
 class TrainingDiverged(ValueError):
-    """A loss or a gradient is not finite, or no validation error of a phase was; raised by all ranks."""
+    """A loss or a gradient is not finite, or no validation error of a phase is finite; raised by all ranks."""
 
 
 class Training:

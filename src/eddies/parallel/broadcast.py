@@ -1,9 +1,8 @@
-"""Text from one rank to all, and work of some ranks whose errors all ranks raise."""
+"""Text that one rank sends to all, and work on some ranks whose errors all ranks raise."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-import numpy as np
 from mpi4py import MPI
 
 from eddies.errors import UserError
@@ -12,27 +11,15 @@ from eddies.parallel.reduction import global_min
 Result = TypeVar("Result")
 
 
-def share_text(comm: MPI.Comm, text: str, root: int = 0) -> str:
-    """Return the text of rank `root` on every rank. The text may hold any bytes, as surrogates."""
-    if comm.size == 1:
-        return text
-    encoded = np.frombuffer(text.encode(errors="surrogateescape"), np.uint8)
-    length = np.array([len(encoded)], np.int64)
-    comm.Bcast(length, root)
-    content = encoded.copy() if comm.rank == root else np.empty(length[0], np.uint8)
-    comm.Bcast(content, root)
-    return content.tobytes().decode(errors="surrogateescape")
-
-
 def first_complaint(comm: MPI.Comm, complaint: str | None) -> str | None:
     """Return on every rank the complaint of the lowest rank that has one; None if no rank has one."""
     rank = int(global_min(comm, comm.size if complaint is None else comm.rank))
-    return None if rank == comm.size else share_text(comm, complaint or "", rank)
+    return None if rank == comm.size else comm.bcast(complaint, rank)
 
 
 def require_same(comm: MPI.Comm, own: str, words: str) -> None:
-    """Raise UserError on all ranks if one was started with another text than rank 0. `words` has a place {} for it."""
-    first = share_text(comm, own)
+    """Raise UserError on all ranks if one has another text than rank 0. `words` describes the text, {} in its place."""
+    first = on_first_rank(comm, lambda: own)
     complaint = first_complaint(comm, None if own == first else (
         f"rank {comm.rank} was started with {words.format(own)}, rank 0 with {words.format(first)}; start all ranks "
         "alike"))
@@ -41,7 +28,7 @@ def require_same(comm: MPI.Comm, own: str, words: str) -> None:
 
 
 def on_first_rank(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
-    """Run an action on rank 0 only and return its result on every rank. One rank sends nothing.
+    """Run an action on rank 0 only and return its result on every rank. With a single rank no message is sent.
 
     All ranks raise the UserError or OSError that it raises.
     """
@@ -67,7 +54,7 @@ def on_first_rank(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
 def on_all_ranks(comm: MPI.Comm, action: Callable[[], Result], kind: type[Exception] = OSError) -> Result:
     """Run an action on all ranks and return its result on this one.
 
-    If it raises an error of this kind on some ranks, all ranks raise it with the text of the lowest of these.
+    If it raises an error of the class `kind` on some ranks, all ranks raise it with the text of the lowest of these.
     """
     result: Any = None
     complaint = None

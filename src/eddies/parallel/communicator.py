@@ -1,4 +1,4 @@
-"""Type of the communicator that everything below the command line gets, and the ranks of one node."""
+"""The type of a communicator, and functions on the ranks of one node."""
 
 import contextlib
 import logging
@@ -27,7 +27,7 @@ def node_ranks(comm: Comm) -> int:
 
 
 def warn_of_few_processors(comm: Comm) -> None:
-    """Log a warning on rank 0 if its ranks take more threads than their node has processors for; collective."""
+    """Log a warning on rank 0 if the threads of its node's ranks exceed the processors of the node; collective."""
     with _node(comm) as node:
         together = within_quota(set().union(*node.allgather(processors())))
         own, number = max(min(within_quota(processors()), together // node.size), 1), threads()

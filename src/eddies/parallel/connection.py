@@ -17,7 +17,7 @@ PATIENCE = 5.0  # seconds that a rank waits for the others to reach the same err
 
 
 class NotConnected(UserError):
-    """MPI connects fewer ranks than were started; `first` is whether this rank is the first of them."""
+    """MPI connects fewer ranks than were started; `first` tells whether this rank is the first of them."""
 
     def __init__(self, message: str, first: bool) -> None:
         super().__init__(message)
@@ -38,7 +38,7 @@ def require_connected(world: MPI.Comm) -> None:
     if size != "OMPI_COMM_WORLD_SIZE" and "SLURM_STEP_NUM_TASKS" in os.environ:
         remedy = f"with `srun --mpi=pmix`, or another type that {library} and `srun --mpi=list` both have"
     raise NotConnected(
-        f"{os.environ[size]} ranks were started ({size}), MPI connects {world.size} of them; start them {remedy}; "
+        f"{os.environ[size]} ranks were started ({size}), but MPI connects {world.size} of them; start them {remedy}; "
         f"for a program without a launcher, unset {size}", os.environ.get(LAUNCHERS[size], "0") == "0")
 
 

@@ -24,8 +24,8 @@ class HaloExchange:
 
     Each rank sends the particles near its lower face down and those near its upper face up. The two faces stay
     separate even if both neighbours are the same rank: a particle then may have two images, which differ in z by a
-    period. Ghost rows from above come first, then those from below. One rank has no ghosts; its methods are not called.
-    Raises HaloError if a slab is thinner than `width`.
+    period. Ghost rows from above come first, then those from below. With a single rank there are no
+    ghosts, and the methods must not be called. Raises HaloError if a slab is thinner than `width`.
     """
 
     def __init__(self, decomposition: SlabDecomposition, positions: np.ndarray, width: float) -> None:
@@ -60,7 +60,7 @@ class HaloExchange:
         return ghosts
 
     def adjoint(self, ghosts: np.ndarray) -> np.ndarray:
-        """Apply the transpose of `forward`: send ghost rows (count, ...) home and add them per owned row (n, ...)."""
+        """Apply the transpose of `forward`: return the sums (n, ...) of ghost rows (count, ...) by owned row."""
         ghosts = np.asarray(ghosts)
         slab, tail = self.decomposition, ghosts.shape[1:]
         owned = np.zeros((self.owned, *tail), ghosts.dtype)
@@ -74,7 +74,8 @@ class HaloExchange:
 class PlaneHalo:
     """Ghost planes: `below` and `above` planes of the neighbouring slabs, periodically, around this rank's planes.
 
-    One rank copies its own planes and sends nothing. Raises HaloError if a slab has fewer planes than either number.
+    With a single rank its own planes are the ghosts, and no message is sent. Raises HaloError if a
+    slab has fewer planes than either number.
     """
 
     def __init__(self, decomposition: SlabDecomposition, below: int, above: int) -> None:
@@ -98,7 +99,7 @@ class PlaneHalo:
         return [below, planes, above]
 
     def adjoint(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """Apply the transpose of `forward`: add ghost planes at home, in place, to the planes (c, z_local, ...)."""
+        """Apply the transpose of `forward`: add ghost planes on their owners, in place, to planes (c, z_local, ...)."""
         highest, planes, lowest = parts
         slab, count = self.decomposition, planes.shape[1]
         if slab.size > 1:

@@ -16,8 +16,8 @@ class ParticleLossError(RuntimeError):
 class Redistribution:
     """Sends each row to a given rank; planned once, applied to any column.
 
-    `destination` (n,) is the rank that each row goes to. Received rows are ordered by their source rank, then as they
-    were there. One rank sends nothing.
+    `destination` (n,) is the rank that each row goes to. Received rows are in the order of their source ranks, and
+    then in the order that they had there. With a single rank no message is sent.
     """
 
     def __init__(self, comm: MPI.Comm, destination: np.ndarray) -> None:
@@ -79,13 +79,13 @@ def migrate(decomposition: SlabDecomposition, columns: dict[str, np.ndarray]) ->
 
 
 def id_block(comm: MPI.Comm, total: int) -> tuple[int, int]:
-    """Return the first id and the end of the block of `total` ids that this rank stores."""
+    """Return the first id and the (exclusive) end of the block of `total` ids that this rank stores."""
     starts = block_starts(total, comm.size)
     return int(starts[comm.rank]), int(starts[comm.rank + 1])
 
 
 class IdOrder:
-    """Moves particles from any distribution into blocks of consecutive ids, one block a rank.
+    """Moves particles from any distribution into blocks of consecutive ids, one block per rank.
 
     `ids` (n,) are this rank's; the ids of all ranks are 0 ... total - 1, each once. `start` and `stop` bound the
     block that `apply` returns. Raises ParticleLossError if an id of the block is missing or occurs twice.

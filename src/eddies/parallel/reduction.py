@@ -1,4 +1,4 @@
-"""Sums, extrema and votes over all ranks. One rank sends nothing."""
+"""Sums, extrema and votes over all ranks. With a single rank no message is sent."""
 
 from collections.abc import Sequence
 
@@ -37,7 +37,7 @@ def any_rank(comm: MPI.Comm, condition: bool) -> bool:
 def sum_flat(comm: MPI.Comm, arrays: Sequence[np.ndarray]) -> None:
     """Replace each array (all of one type) by its sum over ranks, in place and in one message.
 
-    Data-parallel training sums its gradients so: each rank differentiates its share of one global loss.
+    Data-parallel training sums its gradients in this way: each rank differentiates its share of one global loss.
     """
     if comm.size == 1 or not arrays:
         return

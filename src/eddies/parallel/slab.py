@@ -39,4 +39,5 @@ class SlabDecomposition:
         return self._owner[np.clip(plane, 0, self.planes - 1)]
 
     def thinnest(self) -> int:
+        """Return the number of planes of the thinnest slab."""
         return int(np.diff(self.starts).min())

@@ -17,8 +17,8 @@ from eddies.parallel.reduction import global_max
 
 LOOK_SECONDS = 1.0  # between two checks for the file: on a network file system a check may take longer than a step
 
-# Votes of the ranks; the largest counts. A signal is its number above _SIGNALS; _LOST means that the job has lost its
-# run directory.
+# Votes of the ranks; the largest counts. The vote of a signal is _SIGNALS plus its number; _LOST means that the job
+# has lost its run directory.
 _NOTHING, _CHECKPOINT, _TIME, _FILE, _SIGNALS = range(5)
 _LOST = 1000
 
@@ -27,10 +27,10 @@ Loss = Callable[[], UserError | None]
 
 
 class Stopped(Exception):
-    """The job stops on request, all ranks at the same place. `place` says where the next job continues."""
+    """The job stops on request, all ranks at the same place. `then` says what the next job does."""
 
-    def __init__(self, reason: str, place: str = "after the last finished stage") -> None:
-        super().__init__(f"stopped by {reason}; the same command continues {place}")
+    def __init__(self, reason: str, then: str = "continues after the last finished stage") -> None:
+        super().__init__(f"stopped by {reason}; the same command {then}")
 
 
 class StopRequest:
@@ -85,11 +85,13 @@ class StopRequest:
 
     @property
     def reason(self) -> str:
+        """What stops the job, for a message."""
         if self._answer > _SIGNALS:
             return signal.Signals(self._answer - _SIGNALS).name
         return {_FILE: "the file STOP", _TIME: "its limit of wall time"}[self._answer]
 
     def checkpoint_done(self) -> None:
+        """Start the interval to the next checkpoint."""
         self._checkpoint_at = time.monotonic() + self._interval
 
     def _raise_loss(self) -> None:
@@ -107,7 +109,7 @@ class StopRequest:
         now = time.monotonic()
         if self.stop_file is not None and now >= self._look_at:
             self._look_at = now + LOOK_SECONDS
-            if os.path.exists(self.stop_file):  # unlike Path.exists this raises nothing on one rank alone
+            if os.path.exists(self.stop_file):  # unlike Path.exists this never raises on this rank alone
                 return _FILE
         if now >= self._end:
             return _TIME

@@ -35,11 +35,11 @@ class Transpose:
             [(components, z_counts[rank], y, width) for y in y_counts], rank, own)
 
     def to_planes(self) -> None:
-        """Send the column blocks to the plane blocks of their ranks; collective."""
+        """Send each column block to a plane block of its rank; collective."""
         self._exchange(self._columns, self._column_lines, self._planes, self._plane_lines)
 
     def to_columns(self) -> None:
-        """Send the plane blocks to the column blocks of their ranks: inverse and adjoint of `to_planes`."""
+        """Send each plane block to a column block of its rank: inverse and adjoint of `to_planes`."""
         self._exchange(self._planes, self._plane_lines, self._columns, self._column_lines)
 
     def _exchange(self, sent: np.ndarray, sent_lines: np.ndarray, received: np.ndarray,

@@ -1,4 +1,4 @@
-"""Context of an evaluation: what terms may use, computed at first use and then shared."""
+"""Context of an evaluation: the quantities that terms may use, each computed at its first use and then shared."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from eddies.particles.rates import described
 from eddies.particles.resolved_velocity import ResolvedFlow, ResolvedVelocity
 from eddies.scene.terms import TermError
 
-# Numbers held at once in sums over pairs without a gradient: about a core's cache, or a part of a device's memory.
+# Numbers in memory at once in sums over pairs without a gradient. They fit a core's cache, or a part of a GPU's memory.
 PAIR_VALUES_TOGETHER = {"cpu": 1 << 19, "cuda": 1 << 26}
-# Added to moment matrices and sums of weights, as a fraction of their values for evenly spread neighbours. They can
-# then be inverted without neighbours or with coplanar ones; elsewhere the bias is a tenth of a percent.
+# Added to moment matrices and sums of weights, as a fraction of their values for evenly spread neighbours. Their
+# inverse then exists even if there are no neighbours or only coplanar ones; elsewhere the bias is 0.1 %.
 REGULARISATION = 1e-3
 UNDECLARED = 'no term of this model reads "{}": add it to the `reads` of the settings'
 
@@ -39,9 +39,9 @@ class PairSum:
 
     Attributes
     ----------
-    width : largest number of values held for a pair at once; it determines how many pairs are taken together.
-    mutual : whether j gets from i what i gets from j times `parity`. Each pair is then evaluated once.
-    parity : (components,), 1 or -1.
+    width : largest number of values that a pair needs at once; it determines how many pairs are evaluated together.
+    mutual : whether the values of (j, i) are `parity` times those of (i, j). Each pair is then evaluated once.
+    parity : (components,), 1 or -1 for each component.
     needs_moments : whether a term uses `context.moments` with its sums.
     """
 
@@ -56,7 +56,7 @@ class PairSum:
                         "(components, m)")
 
     def compiled(self, context: Context) -> CompiledSum | None:
-        """The same sum for the compiled library, or None. Each class must define it itself; it is not inherited."""
+        """The same sum for the compiled library, or None. Subclasses do not inherit it; each must define its own."""
         return None
 
 
@@ -80,8 +80,8 @@ class Context:
     resolution : finds the resolved velocity; None if no term reads it.
     rows : (k,), the particles for which acceleration and density rate are computed; None: all.
     dtype : type of the pair arithmetic; None: the type of the positions.
-    density : (n,), the particles' density unless terms give it.
-    time : of the evaluation within a run, for which earlier evaluations predict the modes; None: independent of them.
+    density : (n,), density of the particles; None if terms give it, or if no term reads it.
+    time : time of the evaluation in a run, for which the modes are predicted from earlier ones; None: no prediction.
     """
 
     def __init__(self, decomposition: SlabDecomposition, particles: ParticleSet, flow: FlowUnits,
@@ -123,7 +123,7 @@ class Context:
         if name not in self._columns:
             owned = self.density if name == "density" else getattr(self.particles, name)
             if owned is None:
-                raise TermError(UNDECLARED.format(name) + "; or the particles have none")
+                raise TermError(UNDECLARED.format(name) + f"; or the particles have no {name}")
             self._columns[name] = around.column(owned)
         return self._columns[name]
 
@@ -186,7 +186,7 @@ class Context:
             self._sums |= zip(rest, self._torch_sums(rest))
 
     def _compiled_request(self, summand: PairSum) -> CompiledSum | None:
-        """The sum for the compiled library; None if it does not know the summand or the device."""
+        """The sum for the compiled library; None if the library has no such sum or does not support the device."""
         request = vars(type(summand)).get("compiled")
         return request(summand, self) if request and kernels_serve(self.particles.position.device) else None
 
@@ -217,9 +217,9 @@ class Context:
         return ScaledPairs(pairs, self.column, self.flow)
 
     def pairs_in_blocks(self, width: int) -> Iterator[ScaledPairs]:
-        """All pairs, in both orders, of consecutive particles. A block, with `width` numbers a pair, fits the cache.
+        """Yield all pairs, in both orders, in at least one block of consecutive particles.
 
-        There is at least one block.
+        With `width` numbers per pair a block has about PAIR_VALUES_TOGETHER numbers.
         """
         together = max(PAIR_VALUES_TOGETHER[self.particles.position.device.type] // width, 1)
         for block in self.local.neighbors.blocks(together):
@@ -227,7 +227,8 @@ class Context:
 
 
 def _values(summand: PairSum, pairs: ScaledPairs) -> Tensor:
-    """The values of pairs of a sum; raises TermError, with the class, if it fails or returns something else."""
+    """Values of the pairs for a sum. Raises TermError, which names the class, if `pair_values` fails or has a wrong
+    result."""
     with users_code(type(summand), TermError):
         values = summand.pair_values(pairs)
     count = len(pairs.pairs.distance)

@@ -18,7 +18,7 @@ class DenseNetwork(nn.Module):
     ----------
     inputs, outputs : number of features and of outputs.
     hidden : widths of the hidden layers, at least one.
-    seed : of the initial weights, which are drawn in double precision; convert the module for another.
+    seed : of the initial weights. They are drawn in double precision; convert the module for another precision.
     """
 
     def __init__(self, inputs: int, hidden: Sequence[int], outputs: int, seed: int) -> None:

@@ -10,9 +10,9 @@ from eddies.parallel.communicator import Comm, node_rank
 
 
 def prepare_torch(device: str, comm: Comm) -> torch.device:
-    """Return the device of this rank, and set the number of threads to OMP_NUM_THREADS (default 1 a rank).
+    """Return the device of this rank, and set the number of threads to OMP_NUM_THREADS (default 1 per rank).
 
-    Ranks share the GPUs of a node in turn. Raises UserError if a GPU is requested and there is none.
+    The GPUs of a node are assigned to its ranks in turn. Raises UserError if a GPU is requested and there is none.
     """
     torch.set_num_threads(threads())
     if device == "cpu":
@@ -23,5 +23,5 @@ def prepare_torch(device: str, comm: Comm) -> torch.device:
 
 
 def kernels_serve(device: torch.device) -> bool:
-    """Whether the compiled library computes pairs on this device; torch's expressions do on others."""
+    """Whether the compiled library computes pairs on this device. On other devices torch computes them."""
     return device.type == "cpu"

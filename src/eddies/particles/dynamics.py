@@ -27,11 +27,11 @@ class ParticleDynamics:
     model : the terms. If no term reads pairs or the resolved velocity, there is no neighbour list and no halo, and
         particles do not change rank.
     skin : extra radius of list and halo. They are rebuilt when some particle has moved by half of it.
-    dtype : precision of pair arithmetic and of the resolved velocity; by default as the positions. Positions stay
-        in double precision, and the conversion follows their subtraction.
+    dtype : precision of pair arithmetic and of the resolved velocity; by default that of the positions. Positions stay
+        in double precision; only their differences are converted.
     fixed_ranks : particles never change rank or row, as gradients through a few steps require. The halo widens by the
-        distance that they leave their slab.
-    drift : largest such distance, if a term reads the resolved velocity.
+        largest distance of a particle from its slab.
+    drift : largest such distance that is allowed, if a term reads the resolved velocity.
 
     `time` is the time at the beginning of the present step; integrators advance it.
     """
@@ -44,7 +44,7 @@ class ParticleDynamics:
         self.neighborhood: Neighborhood | None = None
         self._local: LocalParticles | None = None
         if "resolved" in model.reads:
-            self.resolution = ResolvedVelocity.on_slabs(decomposition, model.flow, skin / 2 + drift, dtype)
+            self.resolution = ResolvedVelocity.on_slabs(decomposition, model.flow.scales, skin / 2 + drift, dtype)
         if "pairs" in model.reads:
             self.neighborhood = Neighborhood(decomposition, model.flow.cutoff, skin)
 
@@ -62,7 +62,7 @@ class ParticleDynamics:
         self._local = None
 
     def built_at(self, particles: ParticleSet) -> Tensor | None:
-        """Positions (n, 3) of these particles at the last build of halo and list; None without a list."""
+        """Positions (n, 3) of these particles at the last build of halo and list; None if there is none for them."""
         return None if self.neighborhood is None else self.neighborhood.built_at(particles)
 
     def rebuild(self, particles: ParticleSet, built_at: Tensor) -> None:
@@ -72,13 +72,13 @@ class ParticleDynamics:
             self.neighborhood.update(replace(particles, position=built_at))
 
     def begin(self) -> None:
-        """Reset to time 0 of a new run."""
+        """Begin a new run at time 0, without predictions."""
         self.time, self.evaluations = 0.0, 0
         if self.resolution is not None:
             self.resolution.forget()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The time and the predictions of the closure, on which later evaluations depend."""
+        """The time, and the modes from which the next resolved velocity is predicted."""
         resolved = {} if self.resolution is None else self.resolution.state_dict()
         return {"time": torch.tensor(self.time, dtype=torch.float64), **resolved}
 
@@ -119,13 +119,13 @@ class ParticleDynamics:
               density: Tensor | None = None, time: float | None = None) -> Rates:
         """Rates of change of the owned particles, or of `rows` (k,) of them; see LagrangianModel.rates.
 
-        `kept` replaces terms at these particles, and `density` (n,) the density that terms would give. With a `time`
-        the solve for the resolved velocity starts from a prediction by earlier evaluations.
+        `kept` holds stored rates, which replace terms. `density` (n,) replaces the density that terms would give. With
+        a `time` the solve for the resolved velocity starts from a prediction from earlier evaluations.
         """
         return self.model.rates(self.context(particles, rows, density, time), kept)
 
     def rates_after(self, delay: float, particles: ParticleSet) -> Rates:
-        """Rates within a step, at a time after its beginning. Later predictions use this evaluation."""
+        """Rates within a step, at the time `delay` after its beginning. Later predictions use this evaluation."""
         context = self.context(particles, time=self.time + delay)
         rates = self.model.rates(context)
         if self.resolution is not None:

@@ -12,7 +12,7 @@ from eddies.particles.particle_set import as_numpy
 
 
 class _GhostExchange(torch.autograd.Function):
-    """Send rows of owned particles to the ranks that see them; backwards, send gradients of the copies to the owners.
+    """Send rows of owned particles to the ranks that see them; in the backward pass, gradients of copies to the owners.
 
     Both directions are collective. If all ranks compute the same expression, with any number of particles, they also
     take part in the backward exchanges in the same order.
@@ -32,7 +32,8 @@ class _GhostExchange(torch.autograd.Function):
 def with_ghosts(halo: HaloExchange, owned: Tensor, positions: bool = False) -> Tensor:
     """Column (n, ...) of the owned particles, followed by its ghost rows; collective, differentiable.
 
-    Ghost `positions` are shifted by one period in z beyond the periodic face. One rank has no ghosts.
+    If the column holds `positions`, ghosts beyond the periodic face in z are shifted by one period. A single rank has
+    no ghosts.
     """
     if halo.decomposition.size == 1:
         return owned
@@ -53,14 +54,14 @@ class _GlobalSum(torch.autograd.Function):
 
 
 def sum_over_ranks(comm: Comm, values: Tensor) -> Tensor:
-    """Sum of a tensor over ranks, on every rank; differentiable, collective both ways."""
+    """Sum of a tensor over ranks, on every rank; differentiable, collective also in the backward pass."""
     return _GlobalSum.apply(values, comm)
 
 
 def mean_over_ranks(comm: Comm, rows: Tensor) -> Tensor:
-    """Mean (k,) of rows (n, k) over the particles of all ranks, in one message; differentiable, collective both ways.
+    """Mean (k,) of rows (n, k) over the particles of all ranks, in one message; differentiable.
 
-    There must be at least one particle.
+    It is collective also in the backward pass. There must be at least one particle.
     """
     total = sum_over_ranks(comm, torch.cat([rows.sum(0), rows.new_tensor([len(rows)])]))
     return total[:-1] / total[-1]

@@ -22,7 +22,7 @@ class Limits:
 
 
 def find_fault(particles: ParticleSet, limits: Limits, box: PeriodicBox, step: int, rank: int) -> str | None:
-    """Describe the first particle of this rank whose state is not finite or exceeds the limits; None without such.
+    """Describe the first particle of this rank whose state is not finite or exceeds the limits; None if all are sound.
 
     The description has step, rank, particle id, position, velocity, density and the nearest other particle of the rank.
     """
@@ -46,8 +46,9 @@ def find_fault(particles: ParticleSet, limits: Limits, box: PeriodicBox, step: i
 
 
 def find_unplaced(particles: ParticleSet, outside: Tensor, box: PeriodicBox, rank: int) -> str | None:
-    """Describe the first particle of this rank that is farther outside its slab than the box is long; None without
-    such. `outside` (n,) is the distance of each particle from the slab, infinite if its position is not finite."""
+    """Describe the first particle of this rank that is farther outside its slab than the box is long, or return None.
+
+    `outside` (n,) is the distance of each particle from the slab, infinite if its position is not finite."""
     unplaced = outside > box.length
     if not bool(unplaced.any()):
         return None

@@ -16,9 +16,9 @@ from eddies.particles.particle_set import ParticleSet
 
 
 def pair_features(dynamics: ParticleDynamics, particles: ParticleSet) -> Iterator[Tensor]:
-    """Yield the inputs of a model's networks in blocks (features, m), one network after the other; collective.
+    """Yield the inputs of all networks of a model in blocks (features, m) of pairs; collective.
 
-    The density of `particles` is the one that the model sees. Each rank yields at least one block. Each pair appears in
+    `particles` must have the density that the model sees. Each rank yields at least one block. Each pair appears in
     both orders, on the rank that owns its first particle. Therefore counts do not depend on the number of ranks.
     """
     terms = dynamics.model.networks
@@ -29,7 +29,7 @@ def pair_features(dynamics: ParticleDynamics, particles: ParticleSet) -> Iterato
 
 @dataclass(frozen=True)
 class FeatureRange:
-    """Smallest and largest value of each input of a network over all pairs of its training, (features,) each.
+    """Smallest and largest value, both (features,), of each input of the networks over all pairs of the training.
 
     Outside this range the network extrapolates: its values are smooth but were never compared with the truth.
     """
@@ -39,7 +39,7 @@ class FeatureRange:
 
     @classmethod
     def of(cls, comm: Comm, blocks: Iterable[Tensor]) -> FeatureRange:
-        """Range of blocks (features, m) of all ranks, at least one on each rank; collective."""
+        """Range over the blocks (features, m) of all ranks; collective. Each rank must have at least one block."""
         low, high = zip(*map(_extrema, blocks))
         return cls(global_min(comm, np.min(low, axis=0)), global_max(comm, np.max(high, axis=0)))
 

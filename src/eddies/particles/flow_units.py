@@ -12,8 +12,8 @@ from eddies.errors import UserError
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_sum
 
-# The highest wavenumber that particles resolve, in units of their Nyquist wavenumber and of 1/eta, where turbulence
-# ends; and the least transfer of the filter there, since the filter is inverted. Measured in docs/closure.md.
+# Limits of the highest wavenumber that particles resolve: in units of their Nyquist wavenumber; in units of 1/eta,
+# where the spectrum ends; and by the smallest transfer function of the filter, which is inverted (docs/closure.md).
 BEYOND_NYQUIST, BEYOND_DISSIPATION, LEAST_TRANSFER = 1.5, 1.05, 0.02
 MAY_VANISH = ("viscosity", "kolmogorov_length")
 MEAN_DENSITY = 1.0
@@ -36,7 +36,7 @@ class ReferenceScales:
     ----------
     filter_width : d of the filter, the unit of length in Eq. 4.
     spacing : mean distance of particles, (box volume / particles)^(1/3).
-    velocity : rms of one velocity component, its mean not subtracted.
+    velocity : rms of one velocity component; its mean is not subtracted.
     acceleration : rms of one component of the acceleration along trajectories.
     density_mean : mean density rho_0.
     viscosity : kinematic viscosity nu of the fluid; may be 0.
@@ -46,7 +46,8 @@ class ReferenceScales:
     kolmogorov_length : eta of the flow before the filter; its spectrum ends near 1/eta. 0 without viscosity.
 
     Scales of density and sound are None for an incompressible ground truth. A flow at another Mach number supplies its
-    own scales to the same network. Raises ScaleError unless all given scales are finite and positive.
+    own scales to the same network. Raises ScaleError unless all given scales are finite and positive; viscosity and
+    kolmogorov_length may be 0.
     """
 
     filter_width: float
@@ -65,7 +66,7 @@ class ReferenceScales:
             vanishes = name in MAY_VANISH and value == 0
             if value is not None and not vanishes and not (math.isfinite(value) and value > 0):
                 allowed, remedy = (("not negative", "start from another flow ([initial])") if name in MAY_VANISH else
-                                   ("positive, as a model is made dimensionless by it",
+                                   ("positive, because a model divides by it",
                                     "start from a flow that moves and changes ([initial], [forcing])"))
                 raise ScaleError(f"reference scale {name} = {value}: must be finite and {allowed}; {remedy}")
 
@@ -89,7 +90,8 @@ def resolved_wavenumber(spacing: float, filter_width: float, kolmogorov_length: 
 def allowed_step(angle: float, highest: float, speed: float) -> float:
     """Longest time step for velocities resolved up to a wavenumber k_c = `highest`; infinite at rest.
 
-    In this step the rms `speed` u' of a component moves particles by an `angle` of that wave, in radians.
+    In this step a particle with the rms `speed` u' of a component moves by the phase `angle` = k_c u' dt of that wave,
+    in radians.
     """
     return angle / (highest * speed) if speed > 0 else math.inf
 
@@ -118,7 +120,7 @@ class FlowUnits:
 
 
 def measured_scales(comm: Comm, at: Columns, after: Columns, interval: float) -> dict[str, float]:
-    """Root mean squares over all particles, of one component of vectors; collective.
+    """Rms of velocity, density and their rates over all particles, for vectors of one component; collective.
 
     velocity_rms and density_rms (of the fluctuation) at the frame `at`; acceleration_rms and density_rate_rms from the
     change to the frame `after`, an `interval` later. Frames are this rank's rows of `velocity` (n, 3) and, optionally,

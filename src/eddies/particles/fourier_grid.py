@@ -1,6 +1,6 @@
-"""Fields on a grid in torch: linear steps between particles, grid points and Fourier modes, each with its adjoint.
+"""Fields on a grid in torch: linear maps between particles, grid points and Fourier modes, with their adjoints.
 
-Formulas composed of these steps are differentiated automatically.
+Torch differentiates formulas composed of these maps automatically.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class FourierGrid(ModeOperators):
 
     Fields are real tensors (c, z_local, y, x), modes complex ones (c, kz, ky, kx) as in `SpectralGrid`, on the host and
     in the precision of `dtype`. Values at positions are in double precision. Positions (n, 3) lie in this rank's
-    slab or at most `reach` outside it, which is `margin` grid planes. Methods that change between particles, fields and
-    modes are collective, in the backward pass too.
+    slab or at most `reach` outside it, which is `margin` grid planes. Methods that convert between particles, fields
+    and modes are collective, also in the backward pass.
     """
 
     def __init__(self, decomposition: SlabDecomposition, resolved: int, margin: int = 1,
@@ -42,18 +42,18 @@ class FourierGrid(ModeOperators):
         self.shell = torch.from_numpy(np.sqrt(self.spectral.index_squared))
         #: factor from modes of a field to modes of its spline coefficients
         self.prefilter = torch.from_numpy(self.spline.inverse)
-        #: number of times that a stored mode counts in the full sum
+        #: number of times that a stored mode occurs in a sum over all modes
         self.multiplicity = torch.from_numpy(self.spectral.multiplicity)
         self._sphere = (self.shell <= resolved).to(dtype)  # a product is twice as fast as `where`
         self._transfers: dict[float, Tensor] = {}
 
-    # ---- linear steps
+    # ---- linear maps
 
     def to_modes(self, fields: Tensor) -> Tensor:
         return _ToModes.apply(fields, self)
 
     def to_fields(self, modes: Tensor) -> Tensor:
-        """Fields of modes. Modes with kx = 0 contribute the part that belongs to a real field."""
+        """Fields of modes. Of the modes with kx = 0 only the part that belongs to a real field contributes."""
         return _ToFields.apply(modes, self)
 
     def points(self, position: Tensor) -> Points:
@@ -66,7 +66,7 @@ class FourierGrid(ModeOperators):
     def spread(self, values: Tensor, points: Points) -> Tensor:
         """Modes (c, kz, ky, kx) of a sum of splines around points with weights `values` (n, c); differentiable in both.
 
-        It is the adjoint of `at` except for the number of points and the multiplicity of modes.
+        It is the adjoint of `at` up to factors: the number of grid points and the multiplicity of modes.
         """
         return self.to_modes(_Spread.apply(values, points.position, points)) * self.prefilter
 
@@ -122,7 +122,7 @@ class Points:
         return self.spline.around(as_numpy(self.position))
 
     def at(self, parts: Sequence[np.ndarray]) -> Tensor:
-        """Values (n, c) of planes with ghost planes."""
+        """Values (n, c) at the positions, from planes of spline coefficients with ghost planes."""
         return torch.from_numpy(self._splines.at(parts)).to(self.position.device)
 
     def slope_along(self, parts: Sequence[np.ndarray], factors: Tensor) -> Tensor:
@@ -134,8 +134,8 @@ class Points:
         return torch.from_numpy(self.spline.spread(as_numpy(values.double()), self._splines))
 
 
-# Modes with kx > 0 count twice, so the backward transform is the adjoint of the forward transform except for
-# `multiplicity` and the number of points.
+# Modes with kx > 0 count twice, so the backward transform is the adjoint of the forward transform up to the factors
+# `multiplicity` and number of grid points.
 
 
 class _ToModes(torch.autograd.Function):
@@ -185,7 +185,7 @@ class _Squares(torch.autograd.Function):
 
 
 class _Interpolated(torch.autograd.Function):
-    """Spline coefficients (c, z_local, y, x) at positions (n, 3): (n, c)."""
+    """Values (n, c) at positions (n, 3) from spline coefficients (c, z_local, y, x)."""
 
     @staticmethod
     def forward(ctx, planes: Tensor, position: Tensor, points: Points) -> Tensor:

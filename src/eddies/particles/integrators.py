@@ -17,8 +17,8 @@ from eddies.scene.integrators import SCHEMES, Scheme
 class Integrator:
     """A time stepping scheme.
 
-    `memory` holds the rates that a step passes to the next one, with rows as in the particles last returned; `restore`
-    sets it again. In a dense scheme the next step reuses the `rates` between two steps.
+    `memory` holds the rates that a step passes to the next one, with rows as in the particles last returned. `restore`
+    sets it. In a dense scheme a call of `rates` between two steps costs nothing: the next step uses its result.
     """
 
     scheme: Scheme
@@ -46,17 +46,17 @@ class Integrator:
 class VelocityVerlet(Integrator):
     """Kick-drift-kick velocity Verlet of second order, one evaluation of the rates a step.
 
-    Rates may depend on velocity and density. They are evaluated at the values that an Euler step predicts for the end,
-    v + dt a (Groot and Warren 1997, lambda = 1), and also serve the next step's first half kick. A density with a rate
-    is integrated by the trapezoidal rule; a density that terms give is the last evaluated one. A shift velocity is that
-    at the start of the step, of first order.
+    Rates may depend on velocity and density. They are evaluated at the values v + dt a that an Euler step predicts for
+    the end of the step (Groot and Warren 1997, lambda = 1). The first half kick of the next step uses them again. A
+    density with a rate is integrated by the trapezoidal rule; a density that terms give is the last one evaluated. The
+    shift velocity is taken at the start of the step, which is of first order.
     """
 
     scheme = SCHEMES["verlet"]
 
     def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:
-        """Particles between two steps and their rates, evaluated here: the memory belongs to a predicted velocity."""
-        if particles is not self._last:  # the last ones are on their ranks, and the memory is theirs
+        """Particles between two steps and their rates, evaluated here; `memory` has those at a predicted velocity."""
+        if particles is not self._last:  # the last ones are on their ranks already
             particles, _ = self.dynamics.settle(particles)
         return particles, self.dynamics.rates(particles, time=self.dynamics.time)
 
@@ -72,8 +72,8 @@ class CorrectedVerlet(Integrator):
     """Velocity Verlet that evaluates the rates again at the final velocity and density (Besold et al. 2000, DPD-VV).
 
     Both evaluations have the same positions and share neighbour lists and weights. For rates that depend on velocity
-    alone it is Heun's method of second order, stable up to twice the step of velocity Verlet. A shift velocity is that
-    at the start of the step, of first order.
+    alone it is Heun's method of second order, stable up to twice the step of velocity Verlet. The shift velocity is
+    taken at the start of the step, which is of first order.
     """
 
     scheme = SCHEMES["corrected-verlet"]
@@ -88,7 +88,7 @@ class CorrectedVerlet(Integrator):
 
 
 class RungeKutta(Integrator):
-    """An explicit Runge-Kutta scheme whose stages start from the step's start with the rates of the stage before:
+    """An explicit Runge-Kutta scheme. Each stage begins at the start of the step, with the rates of the stage before:
 
         k_s = f(y + c_s dt k_(s-1)),    y + dt sum_s b_s k_s,
 
@@ -113,7 +113,7 @@ class RungeKutta(Integrator):
         return end
 
     def _settled(self, stage: ParticleSet, *others: ParticleSet) -> list[ParticleSet]:
-        """A stage on the ranks of its slabs, and the same particles at other stages beside it."""
+        """Move the particles of a stage to the ranks of their slabs, with their rows at other stages."""
         companions = {f"{number} {name}": column for number, other in enumerate(others)
                       for name, column in other.columns().items() if name != "id"}
         stage, moved = self.dynamics.settle(stage, companions)
@@ -124,7 +124,7 @@ class RungeKutta(Integrator):
         return [stage, *(ParticleSet(**each) for each in columns)]
 
 
-#: By the words of scenes.
+#: Integrators by their names in scenes.
 INTEGRATORS: dict[str, Callable[[ParticleDynamics], Integrator]] = {
     **{kind.scheme.name: kind for kind in (VelocityVerlet, CorrectedVerlet)},
     **{name: partial(RungeKutta, scheme=scheme) for name, scheme in SCHEMES.items() if scheme.nodes},

@@ -14,17 +14,17 @@ from eddies.kernels import kriging as compiled
 from eddies.kernels.library import library
 from eddies.particles.pairs import Pairs
 
-# Rows of weights: of the field, its first and its second derivatives xx, xy, xz, yy, yz, zz; of field and gradient.
+# Rows of weights: for the field, its first and its second derivatives xx, xy, xz, yy, yz, zz; for field and gradient.
 OWN, FIRST, SECOND, UP_TO_FIRST = 0, slice(1, 4), slice(4, 10), slice(0, 4)
-# Rows of the entries (j, k) of a symmetric matrix.
+# Row in SECOND of each entry (j, k) of the matrix of second derivatives.
 PLACES = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 
-# Ratio of the noise variance to the field variance. The smallest distances among random particles require as much.
+# Ratio of the noise variance to the field variance. The smallest distances between random particles require this value.
 NOISE = 1e-3
-# Squared lengths of the Gaussians in the covariance: the narrowest, in units of what a Gaussian filter makes of white
-# noise, and the number of lengths. Each is twice the one before.
+# Squared lengths of the Gaussians in the covariance: the smallest, in units of d^2/6 (white noise after the Gaussian
+# filter), and their number. Each is twice the one before.
 NARROWEST, SCALES = 1.2, 6
-# Least weight of a particle's own value, in units of the inverse variance of the field.
+# Smallest weight of a particle's own value, in units of the inverse variance of the field.
 LEAST_WEIGHT = 0.01
 
 
@@ -58,17 +58,17 @@ def kriging_weights(pairs: Pairs, support: float, filter_width: float,
     """Kriging weights: the best linear estimate sum_j w_j f_j of a field and its derivatives, w = K^-1 b.
 
     K_jk = C(|x_j - x_k|), `covariance`, plus the noise NOISE / max(1 - (r/support)^4, 1e-4) of each particle on the
-    diagonal. r is its distance, so that neighbours at the support enter and leave without a jump. If the receiver is a
-    particle (`sited`), its own value f_i is among the f_j. In the row of the field b is then 1 for the particle and 0
-    for its neighbours. The result is w_i times the difference of f_i and the neighbours' estimate. In the rows of
-    derivatives b is the derivative of C(|x - x_j|) by x. The mean of f is unknown. A multiple of K^-1 1 is subtracted
-    so that the weights add up to zero (ordinary kriging).
+    diagonal. r is its distance; the noise is so large at the support that neighbours enter and leave without a jump. If
+    the receiver is a particle (`sited`), its own value f_i is among the f_j. In the row of the field b is then 1 for
+    the particle and 0 for its neighbours. This row gives w_i times the difference between f_i and the neighbours'
+    estimate. In the rows of derivatives b is the derivative of C(|x - x_j|) with respect to x. The mean of f is
+    unknown. A multiple of K^-1 1 is subtracted so that the weights add up to zero (ordinary kriging).
 
     Returns
     -------
-    The particles' own weights (10, k), and the neighbours', ten of (m,): of the field, its first and its second
-    derivatives xx, xy, xz, yy, yz, zz. They are NaN where the equations cannot be solved or a receiver has more than
-    MOST_NEIGHBORS.
+    The particles' own weights (10, k), and ten arrays (m,) of the neighbours' weights: for the field, its first and its
+    second derivatives xx, xy, xz, yy, yz, zz. They are NaN where the equations cannot be solved or a receiver has more
+    than MOST_NEIGHBORS neighbours.
     """
     displacement = np.ascontiguousarray(pairs.displacement.detach().cpu().T.numpy())
     return compiled.kriging_weights(library(), pairs.offsets.cpu().numpy(), displacement, support, NOISE,
@@ -82,7 +82,7 @@ class Kriging:
 
     Parameters
     ----------
-    pairs : all owned particles with the particles that the rank sees, `seen` in number, within `support`.
+    pairs : of all owned particles with the `seen` particles that the rank sees, within `support`.
     filter_width : d of the filter that the fields have passed.
     with_ghosts : appends the ghost rows to a column of the owned particles; collective.
     """
@@ -114,8 +114,7 @@ class Kriging:
 
     @cached_property
     def laplacian_bound(self) -> Tensor:
-        """Sum of the magnitudes of the Laplacian's weights, (n,); at least 1/d^2, as for a particle without neighbours.
-        """
+        """Sum of the magnitudes of the Laplacian's weights, (n,); at least 1/d^2, also without neighbours."""
         own, others = self._laplacian
         sizes = own.abs() + torch.segment_reduce(others.abs(), "sum", offsets=self._offsets)
         return sizes.clamp_min(self._filter_width**-2)

@@ -13,8 +13,8 @@ from eddies.kernels.modes import ModePasses
 from eddies.parallel.reduction import global_sum
 from eddies.particles.fourier_grid import FourierGrid, Points
 
-# Factor of the penalty in the preconditioner. It suppresses small scales in the first iterations, whose errors the
-# inverse of the filter amplifies most.
+# Factor of the penalty in the preconditioner. In the first iterations it suppresses small scales, because the inverse
+# filter amplifies their errors most.
 SMOOTHING = 5.0
 
 
@@ -25,7 +25,7 @@ class Solution:
     Parameters
     ----------
     modes : (3, kz, ky, kx). at_points : their values (n, 3) at the points.
-    iterations : their number. left : remaining squared residual.
+    iterations : number of iterations. left : remaining squared residual.
     """
 
     modes: Tensor
@@ -58,7 +58,7 @@ class LeastSquares:
         return self.projected(self.grid.spread(values, points) * self.grid.spectral.cells**3)
 
     def descent(self, missing: Tensor, points: Points, modes: Tensor) -> Tensor:
-        """Half the steepest descent at modes u, P B^T (v - B u) - penalty u, from `missing` = v - B u (n, 3).
+        """Half the negative gradient at modes u, P B^T (v - B u) - penalty u, from `missing` = v - B u (n, 3).
 
         It vanishes at the minimum. Collective, differentiable.
         """
@@ -68,7 +68,7 @@ class LeastSquares:
         return torch.from_numpy(self._passes.image(spread.numpy(), -modes.numpy())[0])
 
     def projected(self, modes: Tensor) -> Tensor:
-        """P of modes; differentiable."""
+        """Projection P of modes; differentiable."""
         return self.grid.solenoidal(modes) * self._inside
 
     def preconditioner(self, count: float) -> Tensor:

@@ -31,10 +31,10 @@ TERMS: dict[str, type[Term]] = {
     if isinstance(kind, type) and issubclass(kind, Term) and kind.Settings.word}
 # Name of the forcing among the terms of a model.
 FORCING = "injection"
-# What a term must declare to return a rate. Pressure modes are ignored unless a term reads the density.
+# What a term must declare in `gives` to return each rate. Pressure modes are ignored unless a term reads the density.
 GIVES_OF = {"acceleration": "acceleration", "force_modes": "acceleration", "density": "density",
             "density_rate": "density_rate", "shift_velocity": "shift_velocity", "shift_acceleration": "shift_velocity"}
-# Particles of a rank for which the effect of parameters is looked for: a gradient of all pairs takes much memory.
+# Particles of a rank on which the effect of parameters is checked: a gradient through all pairs takes much memory.
 CHECKED = 64
 # The rates that a linear term stores.
 STORED = (*BY_PARTICLE, "density")
@@ -44,12 +44,12 @@ class LagrangianModel(nn.Module):
     """dv_i/dt, and d rho_i/dt if some term gives it, as the sum of terms.
 
     Terms that do not read the density are evaluated first; the density that they give is the one that others read.
-    Inputs that no term reads are not computed. Raises TermError if a term reads the density and gives a part of it.
+    Inputs that no term reads are not computed. Raises TermError if a term both reads and gives the density.
 
     Parameters
     ----------
     terms : by name, in the order of evaluation.
-    flow : the flow that they were made for, and the units of their rates.
+    flow : the flow that the terms were made for, and the units of their rates.
     """
 
     def __init__(self, terms: Mapping[str, Term], flow: FlowUnits) -> None:
@@ -67,7 +67,7 @@ class LagrangianModel(nn.Module):
         return LagrangianModel({**self.terms, FORCING: Forcing(settings, self.flow)}, self.flow)
 
     def share_parameters(self, other: LagrangianModel) -> None:
-        """Use the parameters of a model of the same terms in the units of another flow: one set for both."""
+        """Use the parameters of `other`, a model of the same terms for another flow: both then share one set."""
         for name, parameter in other.named_parameters():
             module, _, own = name.rpartition(".")
             self.get_submodule(module).register_parameter(own, parameter)
@@ -101,14 +101,14 @@ class LagrangianModel(nn.Module):
 
     @property
     def regresses_density(self) -> bool:
-        """Whether a density rate is learned from the rates at single moments."""
+        """Whether a density rate is learned, and from the rates at single moments alone."""
         through_horizons = any("density_rate" in term.settings.gives and term.settings.learns_through_horizons
                                for term in self.terms.values())
         return self.learns_density and not through_horizons
 
     @property
     def networks(self) -> list[PairTerm]:
-        """The terms with a network of pairs, which return its inputs by `features`."""
+        """The terms with a network of pairs; their `features` are its inputs."""
         return [term for term in self.terms.values() if isinstance(term, PairTerm) and hasattr(term, "features")]
 
     @property
@@ -123,9 +123,9 @@ class LagrangianModel(nn.Module):
     def rates(self, context: Context, kept: Mapping[str, LinearRates] | None = None) -> Rates:
         """Sum of the terms; differentiable, collective.
 
-        It has `acceleration` (k, 3), `force_modes` included, and `density_rate` (k,) and a shift if a term gives them.
-        A `density` that terms give is the whole density (n,), not its deviation. `kept` replaces terms; see
-        `linear_rates`.
+        The result has `acceleration` (k, 3), which includes `force_modes`, and `density_rate` (k,) and a shift if a
+        term gives them. A `density` that terms give is the whole density (n,), not its deviation. `kept` replaces
+        terms; see `linear_rates`.
         """
         kept, sums = kept or {}, []
         for stage in self._stages if self.density_is_given and context.density is None else [list(self.terms.items())]:
@@ -152,7 +152,7 @@ class LagrangianModel(nn.Module):
         return {name: self._linear_rates(term, context) for name, term in terms if term.linear}
 
     def check_terms(self, context: Context) -> None:
-        """Raise TermError for a fault of a term that its shapes do not show; collective.
+        """Raise TermError for a fault of a term that the shapes of its rates do not show; collective.
 
         These are rates that are not finite, a change of the particles in place, a parameter without an effect on the
         rates, and a term that declares itself linear and is not.
@@ -187,14 +187,15 @@ class LagrangianModel(nn.Module):
                 reached = torch.autograd.grad(size, list(parameters.values()), allow_unused=True)
             for parameter, gradient in zip(parameters, reached):
                 if not any_rank(context.comm, gradient is not None):
-                    raise TermError(f'term "{name}": its rates do not depend on the parameter {parameter}, which '
+                    raise TermError(f'term "{name}": its rates do not depend on the parameter {parameter}, so it '
                                     "cannot be learned; use it in forward without detach(), or make it a buffer")
         self.require_linear(context)
 
     @torch.no_grad()
     def require_linear(self, context: Context) -> None:
-        """Raise TermError if a term that declares itself linear is not, at parameters other than the stored ones;
-        collective."""
+        """Raise TermError if a term declares itself linear and is not; collective.
+
+        The test uses parameters other than the stored ones."""
         for name, kept in self.linear_rates(context).items():
             term = self.terms[name]
             others = [torch.linspace(0.3, 1.9, parameter.numel()).reshape(parameter.shape).to(parameter)
@@ -293,7 +294,7 @@ class LinearRates:
 
 
 def _everywhere(term: Term) -> bool:
-    """Whether a sum over pairs is needed at all particles, since others read the density that it gives."""
+    """Whether a sum over pairs is needed at all particles, since other terms read the density that it gives."""
     return isinstance(term, PairTerm) and "density" in term.settings.gives
 
 
@@ -304,15 +305,15 @@ def _evaluated(term: Term, context: Context) -> Rates:
 
 
 def _checked(term: Term, context: Context, evaluate: Callable[[], object]) -> Rates:
-    """The rates that a term gives. Raises TermError, with the class of the term, if it fails, or if it returns
-    something else than Rates of the declared kinds and of one row for each particle."""
+    """The rates that a term gives. Raises TermError, which names the class of the term, if it fails, or if it does not
+    return Rates of the declared kinds with one row for each particle."""
     name, gives = type(term).__name__, term.settings.gives
     with users_code(type(term), TermError):
         result = evaluate()
     if not isinstance(result, Rates):
         raise TermError(f"{name}: forward returns {described(result)}; it must return Rates")
     if "density" in gives and result.density is None and result.pressure_modes is None:
-        raise TermError(f'{name}: declares that it gives "density", and returns none; take it out of `gives` of its '
+        raise TermError(f'{name}: declares that it gives "density", and returns none; remove it from `gives` of its '
                         "settings, or return density or pressure_modes")
     owned = len(context.particles)
     count = owned if context.rows is None or not isinstance(term, PairTerm) else len(context.rows)
@@ -320,7 +321,7 @@ def _checked(term: Term, context: Context, evaluate: Callable[[], object]) -> Ra
         if value is None:
             continue
         if (declared := GIVES_OF.get(rate)) not in (None, *gives):
-            raise TermError(f'{name}: returns {rate}, and does not declare it; add "{declared}" to `gives` of its '
+            raise TermError(f'{name}: returns {rate}, but does not declare it; add "{declared}" to `gives` of its '
                             "settings")
         of_modes = rate.endswith("modes")
         if of_modes:
@@ -336,8 +337,8 @@ def _checked(term: Term, context: Context, evaluate: Callable[[], object]) -> Ra
 def build_model(settings: Mapping[str, TermSettings], paths: Iterable[str], flow: FlowUnits) -> LagrangianModel:
     """Model with initial parameters in double precision. `paths` are the words or import paths of its terms.
 
-    Raises TermError if an import path does not lead to a Term or the term cannot be made, and ImportPathError if it
-    leads to nothing.
+    Raises ImportPathError if an import path leads to nothing, and TermError if it leads to no Term or the term cannot
+    be made.
     """
     terms = {short_name(path): _build_term(path, settings[short_name(path)], flow) for path in paths}
     return LagrangianModel(terms, flow)

@@ -16,7 +16,7 @@ from eddies.particles.rates import Rates
 
 @dataclass(frozen=True)
 class Moment:
-    """This rank's block of all particles in the order of their ids, wherever the particles are.
+    """This rank's block of the list of all particles in the order of their ids. They may lie in any slab.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def between(before: Moment, after: Moment, time: float, box: PeriodicBox) -> Par
     # The velocities select the periodic image: particles may cross the box within a step.
     way = step * (first + last) / 2
     moved = way + box.displacement(torch.from_numpy(after.position - way), torch.from_numpy(before.position)).numpy()
-    # Remainders at the end of the Taylor expansion about the first moment.
+    # Remainders, at the last moment, of the Taylor expansion about the first moment.
     jump, turn = step * (last - first) - step * kick, step * (step * last_pull - kick)
     miss = moved - drift - step * kick / 2
     position = before.position + theta * (drift + theta * (step * kick / 2 + theta * (

@@ -26,7 +26,7 @@ def expected_moment(neighbors: float, cutoff: float) -> float:
 
 
 def products(a: Tensor, b: Tensor) -> list[Tensor]:
-    """The entries a_i b_j of parallel vectors a, b (3, m): six (m,)."""
+    """The six entries a_i b_j, each (m,), of the symmetric products of parallel vectors a, b (3, m)."""
     return [a[i] * b[j] for i, j in ENTRIES]
 
 

@@ -45,7 +45,7 @@ class NeighborList:
         """
         if not (torch.isfinite(receivers).all() and torch.isfinite(senders).all()):
             raise ValueError("neighbour list: a position is not finite")
-        # Slightly too large: `pairs` decides for both orders of a pair alike whether it lies within the cutoff.
+        # Slightly too large: only `pairs` decides, equally for both orders of a pair, whether it is within the cutoff.
         reach = (self.cutoff + self.skin) * (1 + 1e-9)
         columns = neighbors_within(library(), self.box, reach, as_numpy(receivers), as_numpy(senders), exclude_self)
         self.offsets, self.senders = (torch.from_numpy(column).to(receivers.device) for column in columns)

@@ -25,7 +25,7 @@ from eddies.particles.periodic_box import PeriodicBox
 class LocalParticles:
     """The particles that a rank sees at one moment, and quantities that depend on their positions alone.
 
-    Evaluations at the same positions share them. Everything is computed at first use, and collective.
+    Evaluations at the same positions share these quantities. Each is computed at its first use; all are collective.
     """
 
     def __init__(self, owned: Tensor, neighborhood: Neighborhood) -> None:
@@ -34,8 +34,8 @@ class LocalParticles:
         self._kriging: Kriging | None = None
 
     def fit(self, owned: Tensor) -> bool:
-        """Whether they belong to this unchanged tensor of owned positions, the present halo and list, and the present
-        recording of gradients; the same on all ranks."""
+        """Whether these quantities are still valid: for this unchanged tensor of owned positions, the present halo and
+        list, and gradients recorded or not as now. All ranks get the same answer."""
         return self._owned is owned and self._state == self._state_of(owned)
 
     def _state_of(self, owned: Tensor) -> tuple[int, int, bool]:
@@ -70,7 +70,7 @@ class Neighborhood:
     Parameters
     ----------
     decomposition : slabs.
-    cutoff : radius of the neighbour list. A rank sees as far beyond its particles.
+    cutoff : radius of the neighbour list. A rank sees all particles up to this distance from its own.
     skin : extra radius. Halo and list are valid until some particle of any rank has moved by half of it.
     """
 
@@ -87,11 +87,11 @@ class Neighborhood:
         self._ids: Tensor | None = None
 
     def built_at(self, particles: ParticleSet) -> Tensor | None:
-        """Positions (n, 3) of these particles at the last build; None if that was for others. Sends no message."""
+        """Positions (n, 3) of these particles at the last build; None if it was for others. No message is sent."""
         return self._built_at if particles.id is self._ids else None
 
     def outdated(self, particles: ParticleSet) -> bool:
-        """Whether, on any rank, the particles are new ones, or one has moved by more than half the skin or to NaN."""
+        """Whether any rank has new particles, or a particle that has moved by more than half the skin or to NaN."""
         distance = math.inf
         if particles.id is self._ids:
             moved = self.box.displacement(particles.position.detach(), self._built_at)
@@ -156,7 +156,7 @@ def farthest_outside(slab: SlabDecomposition, particles: ParticleSet) -> float:
 def at_home(decomposition: SlabDecomposition, columns: dict[str, Tensor], reach: float) -> dict[str, Tensor]:
     """Move each particle to the rank of its slab and sort a rank's particles by cell, then by id; collective.
 
-    Cells have the side `reach`, so neighbours are close in memory. The order depends on ids and positions alone.
+    Cells have a side of about `reach`, so neighbours are close in memory. The order depends on ids and positions alone.
     """
     device = columns["id"].device
     moved = migrate(decomposition, {name: as_numpy(column) for name, column in columns.items()})

@@ -44,7 +44,7 @@ class Pairs:
 
     @cached_property
     def offsets(self) -> Tensor:
-        """First pair of each output row, and the number of pairs: int64 (count + 1,)."""
+        """First pair of each output row and, at the end, the number of pairs: int64 (count + 1,)."""
         return torch.searchsorted(self.segment, torch.arange(self.count + 1, device=self.segment.device))
 
     def at_receivers(self, column: Tensor) -> Tensor:
@@ -98,7 +98,7 @@ class ScaledPairs:
     Parameters
     ----------
     pairs : in the units of the simulation.
-    column : returns the column "velocity" or "density" (s, ...) of the particles that the pairs number.
+    column : returns the column "velocity" or "density" (s, ...) of the particles that this rank sees.
     flow : the units, and the radius of interaction.
     """
 
@@ -167,7 +167,7 @@ class CompiledSum:
 
     Parameters
     ----------
-    kind, numbers : its name and its constants there (kernels/summands.hpp).
+    kind, numbers : name and constants of the sum in the library (kernels/summands.hpp).
     parameters : (p,), differentiable; none by default.
     scalars : columns (s,) of all particles that this rank sees, differentiable.
     """
@@ -183,8 +183,8 @@ def compiled_sums(space: PairSpace, summands: Sequence[CompiledSum], parities: S
                   velocity: Tensor | None, wanted: np.ndarray, dtype: torch.dtype) -> tuple[Tensor, ...]:
     """Sums (components, s) of each summand over the neighbours of the particles `wanted`, bool (s,); differentiable.
 
-    Other particles have undefined values. `parities` are those of PairSum, `position` and `velocity` (s, 3) those of
-    all particles that this rank sees. Raises ValueError if a position is not finite.
+    The sums of other particles are undefined. `parities` are those of PairSum. `position` and `velocity` (s, 3) are
+    those of all particles that this rank sees. Raises ValueError if a position is not finite.
     """
     columns: list[Tensor] = []
     placed = []

@@ -22,9 +22,9 @@ from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.reconstruction import normalisation, reconstruct_with_gradient
 from eddies.particles.smoothing_kernels import HermiteKernel, SmoothingKernel
 
-# Pairs taken together where no gradient is recorded: about a core's cache.
+# Number of pairs evaluated together where no gradient is recorded: they fill about the cache of a core.
 PAIRS_TOGETHER = 1 << 16
-# Pairs taken together in kriging, ten weights each: enough receivers for all threads.
+# Number of pairs evaluated together in kriging, with ten weights per pair: enough receivers for all threads.
 KRIGED_TOGETHER = 1 << 20
 # Ridge of moving least squares. Values below 1e-4 change no error of a filtered field. For particles that move without
 # a force and gather, the ridge bounds the gradients.

@@ -11,7 +11,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class ParticleSet:
-    """Columns of the particles that this rank owns, one row a particle, without ghosts.
+    """Columns of the particles that this rank owns, one row per particle, without ghosts.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ from eddies.particles.smoothing_kernels import SmoothingKernel, over_distance
 def volumes(kernel: SmoothingKernel, pairs: Pairs) -> Tensor:
     """Volume of each particle, 1 / (W(0) + sum_j W(x_i - x_j)), shape (count,); or the kernel's mean volume.
 
-    `pairs` leaves out the particle itself, which the first term counts.
+    `pairs` must not pair a particle with itself; the term W(0) already counts it.
     """
     if kernel.mean_volume is not None:
         return pairs.distance.new_full((pairs.count,), kernel.mean_volume)

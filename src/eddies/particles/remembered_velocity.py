@@ -1,4 +1,4 @@
-"""A resolved velocity with memory: the forecast from the moment before is the mean of the prior."""
+"""A resolved velocity with memory: the mean of the prior comes from a forecast from the previous moment."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ ANGLE = 0.5  # u' k_c dt of a substep of the forecast
 
 @dataclass
 class RememberedVelocity:
-    """Estimates the velocity of particles from frame to frame, a filter in time.
+    """Estimates the resolved velocity frame by frame, with a forecast from each frame to the next.
 
-    In a time dt the forecast f of a mode loses the share 1 - beta of its worth, beta = exp(-k u' dt / 2C). The prior
-    has the mean beta f and the variance  beta^2 V + (1 - beta^2) P,  with P that of the solver and V that of the
-    estimate before, which N particles and its own prior have determined: 1/V = N/e + 1/(variance of that prior), as if
-    particles were evenly spread, e the energy that the solver expects beyond its modes. So modes that few particles
-    determine collect the information of several frames. Forecasts are those of the Navier-Stokes equations for the
-    modes of the solver, of the velocity before the filter.
+    In a time dt the forecast f of a mode loses the fraction 1 - beta of its reliability, beta = exp(-k u' dt / 2C). The
+    prior has the mean beta f and the variance  beta^2 V + (1 - beta^2) P.  P is the prior variance of the solver. V is
+    the variance of the previous estimate, 1/V = N/e + 1/(variance of its prior). This holds for N evenly spread
+    particles; e is the energy that the solver expects beyond its modes. So modes that few particles determine collect
+    the information of several frames. Forecasts solve the Navier-Stokes equations for the velocity before the filter,
+    in the modes of the solver.
 
     Parameters
     ----------
-    solver : of the first frame, which has no forecast; its grid, prior and tolerance.
-    viscosity : nu. transfer : G of the filter that the particles follow, (kz, ky, kx); 1 for a whole flow.
-    memory : C. weight : factor of the noise in the solver, sigma^2 / e; at least 1 counts here.
+    solver : for the first frame, which has no forecast; grid, prior and tolerance of all frames.
+    viscosity : nu. transfer : G (kz, ky, kx) of the filter of the velocity that particles follow; 1 for the whole flow.
+    memory : C. weight : factor of the noise in the solver, sigma^2 / e; here a value below 1 is replaced by 1.
 
     All methods are collective.
     """
@@ -53,7 +53,7 @@ class RememberedVelocity:
 
     @torch.no_grad()
     def of(self, particles: ParticleSet, time: float) -> Tensor:
-        """The modes (3, kz, ky, kx) of the particles' velocity, relative to its mean, at a time later than before."""
+        """Modes (3, kz, ky, kx) of the particles' velocity relative to its mean; each `time` is later than the last."""
         grid, comm = self.solver.grid, self.solver.grid.decomposition.comm
         mean = mean_over_ranks(comm, particles.velocity)
         relative = particles.velocity - mean
@@ -77,20 +77,20 @@ class RememberedVelocity:
         return modes
 
     def state_dict(self) -> dict[str, Any]:
-        """What the next moment needs of the last: modes and penalty as tensors, and plain values."""
+        """The state that the next moment needs: modes and penalty as tensors, and plain values."""
         if self._latest is None:
             return {}
         time, modes, drift = self._latest
         return {"modes": modes, "penalty": self._penalty, "time": time, "drift": drift.tolist(), "count": self._count}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore that."""
+        """Inverse of `state_dict`."""
         if state:
             self._latest = state["time"], state["modes"], np.array(state["drift"])
             self._penalty, self._count = state["penalty"], state["count"]
 
     def forecast(self, modes: Tensor, step: float) -> Tensor:
-        """The modes after a time, by Runge-Kutta steps of fourth order."""
+        """The modes after the time `step`, by Runge-Kutta substeps of fourth order."""
         whole = modes / self.transfer
         highest = self.solver.grid.resolved * 2 * math.pi / self.solver.grid.decomposition.length
         steps = max(math.ceil(step * highest * self._speed(whole) / ANGLE), 1)

@@ -16,7 +16,7 @@ from eddies.parallel.halo import HaloError
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.exchanges import mean_over_ranks, sum_over_ranks
-from eddies.particles.flow_units import FlowUnits, resolved_wavenumber
+from eddies.particles.flow_units import ReferenceScales, resolved_wavenumber
 from eddies.particles.fourier_grid import FourierGrid, Points
 from eddies.particles.least_squares import LeastSquares, Solution
 from eddies.particles.neighborhood import farthest_outside
@@ -27,11 +27,11 @@ from eddies.spectral.mode_operators import gaussian_transfer
 # between the expected unresolved energy and the noise. The factor is measured in docs/closure.md.
 EXPONENT, DISSIPATION, DISSIPATION_ONSET, WEIGHT = 11 / 3, 5.2, 0.4, 100.0
 # Final residuals relative to the velocities, of a solve that starts from zero and of one that starts from a prediction.
-# The latter residual is spread over all modes, the former stays in poorly determined ones. At twice the latter value a
-# forced flow diverged (docs/closure.md).
+# The residual of the first stays in poorly determined modes, that of the second is spread over all modes. At twice the
+# second value a forced flow diverged (docs/closure.md).
 TOLERANCE, TOLERANCE_PREDICTED = 2e-4, 1e-3
 # Final residual of the solve in the backward pass, relative to the incoming gradient. Gradients of a loss through four
-# frames then have an error of 2e-3, with half of the iterations of 2e-4.
+# frames then have an error of 2e-3, with half of the iterations that 2e-4 needs.
 TOLERANCE_ADJOINT = 3e-3
 MOST_ITERATIONS = 300
 # Wavenumber shells in a band of the energy.
@@ -142,8 +142,9 @@ class ResolvedVelocity:
     wavenumber are determined too.
 
     Conjugate gradients, preconditioned by 1 / (N + 5 sigma^2/P_k), end when the preconditioned residual is `tolerance`
-    of the velocities, or after a given number of `iterations`. With the time of an evaluation they start from a
-    prediction (`predicted`) and end at `tolerance_predicted`; in the backward pass they end at `tolerance_adjoint`.
+    times the velocities, or after a given number of `iterations`. If the time of the evaluation is given, they start
+    from a prediction (`predicted`) and end at `tolerance_predicted`. In the backward pass they end at
+    `tolerance_adjoint`.
 
     Products of modes above a third of the number of cells are aliased. For fields known at particles that error is far
     below the error of the highest modes themselves.
@@ -152,7 +153,7 @@ class ResolvedVelocity:
     ----------
     grid : grid of the modes.
     filter_width : d of the filter.
-    kolmogorov_length : eta of the flow; 0 if its spectrum has no end.
+    kolmogorov_length : eta of the flow; 0 if its spectrum has no dissipation range.
     weight : factor of the noise.
 
     Differentiable in the particles' positions and velocities: the backward pass solves the same system. All methods are
@@ -177,13 +178,12 @@ class ResolvedVelocity:
         self.forget()
 
     @classmethod
-    def on_slabs(cls, decomposition: SlabDecomposition, flow: FlowUnits, margin: float = 0.0,
+    def on_slabs(cls, decomposition: SlabDecomposition, scales: ReferenceScales, margin: float = 0.0,
                  dtype: torch.dtype | None = None, weight: float = WEIGHT) -> ResolvedVelocity:
-        """On a grid with one cell for each plane of the slabs, in double precision by default.
+        """Make it on a grid with one cell for each plane of the slabs, in double precision by default.
 
         Particles may be outside their slab by `margin` at most.
         """
-        scales = flow.scales
         highest = resolved_wavenumber(scales.spacing, scales.filter_width, scales.kolmogorov_length)
         shells = int(highest * decomposition.length / (2 * math.pi) + 1e-9)
         resolved = min(max(shells, 1), (decomposition.planes - 1) // 2)
@@ -246,10 +246,10 @@ class ResolvedVelocity:
 
         The nearer of the last two evaluations at different times is extrapolated with the rates of both (Adams and
         Bashforth). It moves with the mean velocity (3,) of the particles. Each mode is reduced by its expected
-        error. In a time dt a flow with rms `speed` u' of a component turns the phase of a mode by theta = k u' dt. The
-        prediction then misses (5/12) theta^3, or 1.6 times the rms for normally distributed velocities. The factor
-        1 / (1 + (2 theta)^6) removes modes that velocities of two or three u' would spoil. A wrong mode is
-        worse than a missing one: it is corrected only near particles and grows elsewhere.
+        error. In a time dt a velocity equal to the rms `speed` u' of a component turns the phase of a mode by theta =
+        k u' dt. The relative error of the prediction is then (5/12) theta^3; its rms over normally distributed
+        velocities is 1.6 theta^3. The factor 1 / (1 + (2 theta)^6) removes modes that velocities of two or three u'
+        would spoil. A wrong mode is worse than a missing one: it is corrected only near particles and grows elsewhere.
         """
         if not self._moments:
             return None
@@ -281,7 +281,7 @@ class ResolvedVelocity:
         self.speed = float(state["speed"])
 
     def carried(self, modes: Tensor, step: float, mean: np.ndarray) -> Tensor:
-        """Modes of a field that has moved with the mean velocity for a time."""
+        """Modes of a field that has moved with the mean velocity for the time `step`."""
         turns = [torch.exp(-1j * step * velocity * k) for k, velocity in zip(self.grid.wavevector, mean)]
         return math.prod(turns) * modes
 
@@ -308,7 +308,8 @@ class ResolvedVelocity:
         return self.equations.solve(flow.points, right, count, enough, self.iterations, self.most_iterations)
 
     def _adjoint(self, flow: ResolvedFlow) -> Callable[[Tensor], Tensor]:
-        """Function from the gradient by modes of the minimum to the gradient by the descent d(u; x, v) there.
+        """Function that turns the gradient of a loss by the modes u of the minimum into its gradient by the descent
+        d(u; x, v) there.
 
         d vanishes at the minimum and changes with u by -A, so du = A^-1 dd (implicit function theorem). A is symmetric
         in the inner product that weights modes by their multiplicity m. Its transpose is therefore m A (1/m).

@@ -103,8 +103,8 @@ class HermiteKernel:
     ----------
     support : h.
     values, slopes : (knots,), the dimensionless W h^3 and d(W h^3)/dq; all results are differentiable in both.
-    mean_volume : see SmoothingKernel. Without one, values must not be negative. Slopes above three times the value per
-        cell are then reduced to it, since a cubic would become negative between the knots.
+    mean_volume : see SmoothingKernel. Without one, values must not be negative. Slopes steeper than three times the
+        value per cell are then reduced to this limit: beyond it a cubic may become negative between the knots.
     """
 
     def __init__(self, support: float, values: Tensor, slopes: Tensor, mean_volume: float | None = None) -> None:
@@ -194,7 +194,7 @@ class KernelNetwork(nn.Module):
 
     @property
     def formula(self) -> str:
-        """The formula of W, stored with the weights, which have no meaning in another one."""
+        """The formula of W. It is stored with the weights, which are valid for this formula alone."""
         bell = "g" if self.cutoff == "smooth" else f"/ (1 + exp({SIGMOID_SHARPNESS:g} (q - 1)))"
         return f"{'exp(NN)' if self.positive else 'NN'} {bell}"
 

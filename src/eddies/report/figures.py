@@ -29,7 +29,7 @@ STYLE = {
     "font.size": 10.5, "axes.titlesize": 10.5, "axes.labelsize": 10.5, "legend.fontsize": 9,
     "xtick.labelsize": 9, "ytick.labelsize": 9, "font.family": "DejaVu Sans",
     "mathtext.fontset": "dejavusans",
-    "axes.titley": 1.0,  # a fixed place: finding one measures all tick labels again
+    "axes.titley": 1.0,  # a fixed place: an automatic one measures all tick labels again
     "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.8, "lines.linewidth": 1.7,
     "axes.formatter.limits": (-4, 4),  # wider tick labels get a common factor
     "legend.frameon": False, "figure.dpi": 150, "savefig.dpi": 150, "axes.prop_cycle": matplotlib.cycler(

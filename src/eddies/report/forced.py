@@ -21,7 +21,7 @@ SERIES = {"energy": "kinetic energy", "acceleration_rms": "rms of an acceleratio
 
 
 def averages(run: Frames, frames: np.ndarray, turnover: float, whose: str) -> dict[str, dict[str, float]]:
-    """Return mean (named `whose`), slope per turnover, both with standard errors, and standard deviation of SERIES."""
+    """Return for each of SERIES its mean (as `whose`), its slope per turnover, their errors, and its deviation."""
     blocks, found = Blocks.of(run.times[frames] / turnover, 1.0), {}
     samples = {"energy": np.array([mean_energy(run, frame) for frame in frames]),
                "acceleration_rms": np.array([np.std(run.read(frame, "acceleration")) for frame in frames])}
@@ -62,7 +62,7 @@ def section(run: Rollout, span: StationarySpan) -> Section:
         f"The model is forced with a power of {run.powers[0]:.3g} per mass. Its averages from "
         f"{run.model.times[late[0]] / turnover:.3g} to {times[-1] / turnover:.3g} T are compared with those of the "
         f"filtered flow over {span.turnovers:.3g} turnovers of its stationary state. Standard errors are those of "
-        "blocks of a turnover or more, because closer frames are no independent samples. PDFs are compared with those "
+        "blocks of a turnover or more, because closer frames are not independent samples. PDFs are compared with those "
         "of the true tracers at the start, each in units of its own standard deviation.")
     shown.metrics = [
         Metric("energy", SERIES["energy"], {
@@ -103,7 +103,7 @@ def filtered_energy(run: Rollout, span: StationarySpan) -> tuple[Estimate, float
 
 
 def mean_spectra(run: Rollout, span: StationarySpan) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], Estimate]:
-    """Return wavenumbers, mean spectra of filtered flow and model, and the error of the latter, (shells,) each."""
+    """Return wavenumbers, mean spectra (shells,) of filtered flow and model, and the spectrum error of the model."""
     chosen = run.late_spectra()
     spectra = np.array([run.spectra["model"][int(frame)] for frame in chosen])
     known = min(spectra.shape[1], span.spectra.shape[1])

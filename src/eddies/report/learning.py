@@ -56,7 +56,7 @@ def _mark_phases(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
 
 
 def _validation(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
-    """Draw one line a phase, because each has its own measure, from the error before its first step; circle minima."""
+    """Draw one line per phase, from the error before its first step, since measures differ by phase; circle minima."""
     axis.set(title="Validation error, minima circled", ylabel="validation error")
     missing, highest = np.full(len(history["step"]), np.nan), 0.0
     after, before = (history.get(name, missing) for name in ("validation_error", "start_error"))

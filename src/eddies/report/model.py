@@ -41,17 +41,15 @@ def section(description: Mapping[str, Any], table: Table, acceleration: Table, d
             history: Table | None, source: str | None = None, others: Sequence[str] = ()) -> Section:
     """Return the section with the errors at the last frame, from the tables of the product.
 
-    source: path of the run that the weights come from, if it is another one; it has made the history too.
+    source: path of the run that the weights and the history come from, if it is another one.
     history: None if nothing was trained. others: the ground truths that the model was trained on, if they do not
     include the one of this flow, or of the source.
     """
     last = int(np.argmax(table["delay"]))
     at = {name: float(values[last]) for name, values in table.items()}
     terms = ", ".join(description["terms"])
-    metrics = [Metric(key, label, at.get(column), f"terms {terms} have none")
+    metrics = [Metric(key, label, at.get(column), f"not defined for the terms {terms} in this flow")
                for key, (column, label) in METRICS.items()]
-    metrics.append(Metric("delay", "time of these errors after the training window", at["delay"]))
-    metrics += [*training_metrics(description), *coefficient_metrics(description)]
     since, trained = "training window", ""
     if source is not None:
         since = "release of the tracers, or the training window"
@@ -59,6 +57,8 @@ def section(description: Mapping[str, Any], table: Table, acceleration: Table, d
         whose = "this flow" if source is None else f"the flow of {source}, where its weights come from"
         trained = f" Trained on {', '.join(others)}, and not on {whose}."
         since = "release of the tracers" if source is None else since
+    metrics.append(Metric("delay", f"time of these errors after the {since}", at["delay"]))
+    metrics += [*training_metrics(description), *coefficient_metrics(description)]
     part = Section("model", "Model", f"Terms: {terms}.{trained} A-priori test: the model sees the true particles of a "
                    f"frame. Numbers are those of the last frame, {at['delay']:.3g} after the {since}.", metrics=metrics,
                    main=("acceleration_error", "filtered_pressure_gradient_error"))

@@ -85,9 +85,10 @@ class Section:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """The run of a page: its name, its title, the text of its scene, and a row for each product after a header.
+    """The run of a page: its name, its title and the text of its scene.
 
-    warnings: sentences on products that do not fit together. links: title and relative path of other pages.
+    products: a header, then a row for each product. warnings: sentences on products that do not fit together. links:
+    title and relative path of other pages.
     """
 
     name: str

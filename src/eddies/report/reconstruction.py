@@ -1,4 +1,4 @@
-"""The section on fields reconstructed from tracks: errors over time, where they can be known, and the last plane."""
+"""The section on fields reconstructed from tracks: errors over time and the last plane."""
 
 from collections.abc import Mapping
 
@@ -27,16 +27,16 @@ def section(about: Mapping[str, float | str], errors: Mapping[str, np.ndarray], 
     both = {name: (time, values) for name, (time, values) in both.items() if np.isfinite(values).any()}
     means = {name: float(np.nanmean(both[name][1])) if name in both else None for name in ERRORS}
     metrics = [Metric("reconstruction_method", "method", about["method"]),
-               Metric("particles_of_a_frame", "particles of a frame", about["particles"]),
+               Metric("particles_of_a_frame", "particles per frame", about["particles"]),
                *(Metric(name, f"error of the {label}, mean over time (normalised L2)", means[name],
                         "the true field is not known" if name != "validation_error" else "no track was left out")
                  for name, (label, _, _) in ERRORS.items()),
-               Metric("seconds_per_frame", "seconds of a frame (median)", float(np.median(errors["seconds"])))]
+               Metric("seconds_per_frame", "seconds per frame (median)", float(np.median(errors["seconds"])))]
     text = (f"Fields of {len(errors['time'])} frames from the velocities of {about['particles']:.0f} particles, by "
             f"{about['method']}, up to wavenumber {about['highest_wavenumber']}.")
     if about["holdout"]:
-        text += (f" A second reconstruction leaves out {about['holdout']:.0%} of the tracks; its error there estimates "
-                 "that of the field.")
+        text += (f" A second reconstruction leaves out {about['holdout']:.0%} of the tracks. Its error at these tracks "
+                 "estimates the error of the field.")
     shown = Section("reconstruction", "Reconstruction", text, metrics=metrics,
                     main=("validation_error", "velocity_error", "gradient_error"))
     shown.add_figure("reconstruction", "Reconstructed fields", overview(both, plane),

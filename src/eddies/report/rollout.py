@@ -1,4 +1,4 @@
-"""The section on a rollout: figures, and numbers at the last time of both the model and the true tracers."""
+"""The section on a rollout: figures, and numbers at the last time that model and true tracers have in common."""
 
 from collections.abc import Mapping
 
@@ -36,7 +36,8 @@ def section(run: Rollout, main: bool = True) -> Section:
 
     Without `main` the section has all numbers, but only the figures by which variants are compared.
     """
-    steps = f"time step {float(run.attributes['time_step']):.3g}" if "time_step" in run.attributes else "without a step"
+    taken = "time_step" in run.attributes
+    steps = f"time step {float(run.attributes['time_step']):.3g}" if taken else "no step was taken"
     method = moved_by(run.attributes)
     text = (f"Moved by: {method}. Integrator: {run.attributes['integrator']}, {steps}. "
             f"T = {run.turnover:.3g} is the eddy turnover time. ")
@@ -61,8 +62,8 @@ def section(run: Rollout, main: bool = True) -> Section:
         shown.notices.append(f"The rollout is not compared with the truth: {error}. Its status: {run.status}.")
         shown.metrics += [Metric(key, key.replace("_", " "), None, str(error)) for key in MAIN[1:]]
         return shown
-    shown.text += (f"Numbers are those at t = {last / run.turnover:.3g} T, the last time of both model and true "
-                   "tracers.")
+    shown.text += (f"Numbers are those at t = {last / run.turnover:.3g} T, the last time that model and true tracers "
+                   "have in common.")
     shown.notices += _notices(run, last)
     shown.metrics.append(Metric("last_common_time", "last common time / T", last / run.turnover))
     _add_particles(shown, run, main)
@@ -140,7 +141,7 @@ def _add_invariants(shown: Section, run: Rollout, main: bool) -> None:
     statistics = against_truth.last_invariants(run)
     shown.metrics += [
         Metric("qr_kl", "KL divergence of the Q–R joint PDF", statistics.divergence),
-        Metric("qr_kl_floor", "KL divergence between two samples of the true Q–R plane, of the same size",
+        Metric("qr_kl_floor", "KL divergence of the Q–R joint PDF between two samples of the truth of equal size",
                statistics.floor)]
     flows = against_truth.conditional_flows(run, statistics.bins) if main else None
     shown.add_figure(
@@ -172,13 +173,13 @@ def _add_particles(shown: Section, run: Rollout, main: bool) -> None:
         Metric("energy_ratio_no_force", "the same ratio for particles without any force",
                float(truth["energy"][0] / truth["energy"][-1])),
         Metric("velocity_error", "velocity error by particle at the end (normalised L2)", final["velocity_error"]),
-        Metric("early_time", "early time: half a turnover, or the end if that is earlier / T", early / run.turnover),
+        Metric("early_time", "early time / T: half a turnover, or the end if that is earlier", early / run.turnover),
         Metric("early_velocity_error", "velocity error by particle at the early time", early_error),
         Metric("early_velocity_error_no_force", "the same error for particles without any force", early_without),
         Metric("velocity_kl", "KL divergence of the velocity PDF at the end", final["velocity_kl"]),
         Metric("acceleration_kl", "KL divergence of the acceleration PDF at the end", final["acceleration_kl"]),
-        *(Metric(f"{column}_kl_floor", f"KL divergence between two samples of the true {column}, of the same size",
-                 floor) for column, floor in floors.items()),
+        *(Metric(f"{column}_kl_floor", f"KL divergence of the {column} PDF between two samples of the truth of equal "
+                 "size", floor) for column, floor in floors.items()),
         Metric("acceleration_rms_ratio", "rms of the acceleration, model / truth",
                float(np.std(accelerations.model) / np.std(accelerations.truth))),
     ]
@@ -228,11 +229,11 @@ def _add_paths(shown: Section, run: Rollout, main: bool) -> None:
         return
     shown.add_figure(
         "lagrangian", "Lagrangian statistics", rollout_figures.path_statistics(model, truth, run.turnover),
-        f"Over {truth.times[-1] / run.turnover:.2f} T. A, C: correlations. D: variance of a component. B, E: second "
-        "moment and flatness (3 if Gaussian) of velocity increments over a lag. F: separation of nearest neighbours, "
-        "in units of its first mean square. G, H: a particle and its three nearest neighbours: R² in units of its "
-        "first value, and the eigenvalues of the moments over R² (1/3 each for a regular tetrahedron). Rms of "
-        "ln(model / truth): "
+        f"Over {truth.times[-1] / run.turnover:.2f} T. A, C: autocorrelations of velocity and acceleration. B, E: "
+        "second moment and flatness (3 if Gaussian) of velocity increments over a lag. D: variance of an acceleration "
+        "component. F: mean square change of the separation of nearest neighbours, over its first mean square. G, H: "
+        "tetrads, a particle and its three nearest neighbours: R² in units of its first value, and the eigenvalues of "
+        "the moments over R² (1/3 each for a regular tetrahedron). Rms of ln(model / truth): "
         + ", ".join(f"{name} {errors[key]:.2g}" for name, key in (
             ("flatness", "flatness_error"), ("pairs", "pair_dispersion_error"), ("tetrads", "tetrad_size_error"),
             ("shape of tetrads", "tetrad_shape_error"))) + ".")
@@ -258,5 +259,5 @@ def _add_disorder(shown: Section, run: Rollout, main: bool) -> None:
         f"A: distance to the nearest neighbour at t = {position.time / run.turnover:.2f} T; KL divergence "
         f"{divergence:.2g}. B: variance of the number of particles in cells of {disorder.CELL:g} mean spacings, 1 for "
         f"random points. At that time it is {drift['count_variance']['truth']:.2f} (true tracers) and "
-        f"{drift['count_variance']['model']:.2f} (model). Particles cluster where the model's value is above the "
-        "truth's.")
+        f"{drift['count_variance']['model']:.2f} (model). If the model's value is above the truth's, its particles "
+        "cluster.")

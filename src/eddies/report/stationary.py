@@ -65,7 +65,7 @@ def section(statistics: Mapping[str, np.ndarray], span: StationarySpan) -> Secti
     shown = Section(
         "stationary", "Stationary turbulence",
         f"Averages over {span.turnovers:.3g} large-eddy turnovers of the forced flow, t = {first:.3g} to {last:.3g}. "
-        "Standard errors are those of blocks of a turnover or more, because closer frames are no independent samples. "
+        "Standard errors are those of blocks of a turnover or more, because closer frames are not independent samples. "
         "Deviations are standard deviations in time. Literature: values at this Re_λ.",
         metrics=[Metric(row.key, row.label, columns_of(row)) for row in comparison(span)])
     shown.add_figure(

@@ -23,11 +23,11 @@ def section(found: Mapping[str, float | str], trials: Trials) -> Section:
             "size", "error", "difference", "seconds_per_turnover")))]
     shown = Section(
         "step", f"Step: {found['integrator']}, {size} {found['size']:.4g}",
-        f"Test rollouts of {found['turnovers']:.2g} turnovers on the ground truth, without stability limits. A step "
-        "has converged if it adds less than 2 % to the error of the final velocities. For this, halving the step may "
-        f"change the velocities by {found['tolerance']:.2g}. The cheapest converged step is chosen. It takes "
-        f"{found['seconds_per_turnover']:.3g} s per turnover. Its error is {found['error']:.4f}; half the step has "
-        f"{found['error_with_half']:.4f}. The search took {found['seconds']:.3g} s.", metrics=metrics)
+        f"Test rollouts of {found['turnovers']:.2g} turnovers on the ground truth; no stability limit shortens their "
+        "steps. A step has converged if it adds less than 2 % to the error of the final velocities: halving it must "
+        f"change them by less than {found['tolerance']:.2g} of their rms. The cheapest converged step is chosen. It "
+        f"takes {found['seconds_per_turnover']:.3g} s per turnover. Its error is {found['error']:.4f}; the error with "
+        f"half the step is {found['error_with_half']:.4f}. The search took {found['seconds']:.3g} s.", metrics=metrics)
     shown.add_figure("step", "Convergence in the step", convergence(found, trials, size),
                      "Circle: the chosen step. Dashed: the largest change of a converged step.")
     return shown
@@ -35,7 +35,7 @@ def section(found: Mapping[str, float | str], trials: Trials) -> Section:
 
 @styled
 def convergence(found: Mapping[str, float | str], trials: Trials, size: str) -> Figure:
-    """Draw the change by halving the step over the step, and the error over the seconds of a turnover."""
+    """Draw the change by halving the step over the step, and the error over the seconds per turnover."""
     figure, ((change, error),) = panels(1, 2, (4.6, 3.1), foot=0.3)
     for name, columns in trials.items():
         changes = np.maximum(columns["difference"][1:], NO_CHANGE)

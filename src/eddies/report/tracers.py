@@ -13,16 +13,21 @@ from eddies.report.figures import DNS, FOURTH, GUIDE, MODEL, SECOND, TRUTH, lett
 from eddies.report.page import Metric, Section
 
 COLOURS = (TRUTH, MODEL, SECOND, FOURTH)
-TOO_FEW = "too few frames, or too few pairs of tracers"
+TOO_FEW = "there are too few frames, or too few pairs of tracers"
 
 
-def section(found: TracerStatistics, scales: Mapping[str, float], power: float) -> Section:
-    """Return the section. `scales` are of the flow at the release; `power` is the forcing power per mass."""
+def section(found: TracerStatistics, scales: Mapping[str, float], power: float | None,
+            filtered: bool = True) -> Section:
+    """Return the section. `scales` are those of the flow at the release; `power` is the forcing power per mass, None if
+    it is unknown.
+
+    filtered: whether the tracers follow the filtered flow, not the whole flow.
+    """
     kurtosis, (first, last) = found.kurtosis, found.energy_ratio[[0, -1]]
     metrics = [
         Metric("tracer_energy_ratio_first", "⟨v·v⟩ of tracers / filtered field, at the release", float(first)),
         Metric("tracer_energy_ratio_last", "the same ratio at the last stored field", float(last)),
-        Metric("tracer_energy_sampling_error", "standard deviation of this ratio by random sampling",
+        Metric("tracer_energy_sampling_error", "sampling error of the ratio at the release (standard deviation)",
                float(found.energy_error[0])),
         Metric("acceleration_kurtosis", "kurtosis of the acceleration (Gaussian: 3)", kurtosis),
     ]
@@ -32,22 +37,26 @@ def section(found: TracerStatistics, scales: Mapping[str, float], power: float) 
         metrics.append(Metric("acceleration_constant", "a_0 = a_rms² ν^½ ε^(−3/2) at the release (unfiltered flow: "
                               f"{whole:.3g}, Sawford et al. 2003)", float(constant)))
     metrics += [
-        Metric("structure_function_exponent", "first exponent of the Lagrangian structure function (τ²)",
+        Metric("structure_function_exponent", "exponent of the Lagrangian structure function at short lags (smooth: 2)",
                found.structure_exponent, TOO_FEW),
-        Metric("ballistic_exponent", "first exponent of the pair dispersion (ballistic: t²)",
+        Metric("ballistic_exponent", "exponent of the pair dispersion at short times (ballistic: 2)",
                found.ballistic_exponent, TOO_FEW),
-        Metric("ballistic_prefactor", "⟨|r − r₀|²⟩ / S₂(r₀) t² at the first frame", found.ballistic_prefactor, TOO_FEW),
+        Metric("ballistic_prefactor", "⟨|r − r₀|²⟩ / (S₂(r₀) t²) at the first frame after the release (ballistic: 1)",
+               found.ballistic_prefactor, TOO_FEW),
     ]
-    forcing = f"which stays forced with a power of {power:.3g} per mass" if power > 0 else "without forcing"
-    shown = Section("tracers", "Tracers", f"Tracers follow the filtered flow, {forcing}. Their accelerations are those "
-                    "of the eddies that pass the filter, and smaller than the literature's for the whole flow.",
-                    metrics=metrics)
+    text = f"Tracers follow the {'filtered' if filtered else 'whole'} flow."
+    if power is not None:
+        text += f" It stays forced with a power of {power:.3g} per mass." if power > 0 else " It is not forced."
+    if filtered:
+        text += (" Their accelerations are those of the eddies that pass the filter. They are smaller than the "
+                 "literature's for the whole flow.")
+    shown = Section("tracers", "Tracers", text, metrics=metrics)
     shown.add_figure(
         "tracers", "Statistics of the tracers", tracers(found, scales),
         "A: energy; grey: two standard deviations for the same number of random points. B: accelerations from "
         f"differences of frames, in units of their rms at the time; kurtosis {kurtosis:.3g}. C: structure function of "
-        "a velocity component. D: pairs by their first distance r₀; dashed: the ballistic law S₂(r₀) t² from their "
-        "first velocities.")
+        "a velocity component. D: pairs by their initial distance r₀; dashed: the ballistic law S₂(r₀) t² from their "
+        "initial velocities.")
     return shown
 
 

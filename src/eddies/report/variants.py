@@ -26,13 +26,13 @@ KEY = "variants"
 COST = "wall_seconds"
 LOOKS = list(zip((MODEL, TRUTH, SECOND, FOURTH, THIRD, DNS, FILTERED), "os^DvPX"))
 # Columns of the table after the measures: key in the rows, title.
-COSTS = {"end": "time of the end (T)", "stopped_at": "unstable at (T)",
-         "wall_seconds": "wall s per T", "wall_seconds_low": "lower quartile", "wall_seconds_high": "upper quartile",
-         "core_seconds": "core s per T", "seconds_per_step": "s per step", "time_step": "time step",
+COSTS = {"end": "end of the rollout (T)", "stopped_at": "became unstable at (T)", "wall_seconds": "wall seconds per T",
+         "wall_seconds_low": "wall seconds, lower quartile", "wall_seconds_high": "wall seconds, upper quartile",
+         "core_seconds": "core seconds per T", "seconds_per_step": "seconds per step", "time_step": "time step",
          "ranks": "ranks", "weights": "learned numbers", "training_seconds": "training (s)",
-         "training_steps": "training (steps)", "step_seconds": "finding the step (s)",
+         "training_steps": "training (steps)", "step_seconds": "search for the step (s)",
          "break_even_simulation": "cheaper than the direct simulation after (T)",
-         "break_even_grid": "cheaper than the cheapest grid as accurate at T/2 after (T)"}
+         "break_even_grid": "cheaper than the cheapest grid of equal or smaller error at T/2 after (T)"}
 LEGEND = ("Wall seconds per turnover T, with the quartiles of the time of a step as bars. Bars of errors are standard "
           "deviations over realisations, if there are several. Dashed line: Pareto front, the variants that no other "
           "one beats in both error and time. Crosses at the top: variants that became unstable, at the time given.")
@@ -53,7 +53,7 @@ class ErrorAgainstTime:
 
     @property
     def drawn(self) -> list[str]:
-        """The measures of DRAWN that a row has. For rollouts shorter than T/2 the velocity error is that at the end."""
+        """The measures of DRAWN that some row has. If no rollout reaches T/2, the velocity error is that at the end."""
         replaced = {} if self.finished("velocity_error_half") else {"velocity_error_half": "velocity_error_end"}
         return [name for name in (replaced.get(name, name) for name in DRAWN) if self.finished(name)]
 
@@ -67,7 +67,7 @@ class ErrorAgainstTime:
     def summary(self) -> list[str]:
         """Sentences: where the subject is worth its cost, and which coarse grid is as accurate.
 
-        A variant that became unstable counts as one without numbers.
+        A variant that became unstable is treated as one without numbers.
         """
         numbers = [row if is_stable(row) else {**row, **dict.fromkeys(self.drawn)} for row in self.rows]
         subject = next(row for row in numbers if row["name"] == self.subject)
@@ -109,7 +109,7 @@ def section(table: ErrorAgainstTime, notes: Sequence[str] = ()) -> Section:
 
 def _notice(row: Row) -> str:
     when = "" if row["stopped_at"] is None else f" (at {row['stopped_at']:.3g} T)"
-    untimed = "; too few steps to time one" if row[COST] is None and not row["status"].startswith("failed") else ""
+    untimed = "; too few steps to time" if row[COST] is None and not row["status"].startswith("failed") else ""
     return f"{row['label']}{when}: {row['status']}{untimed}"
 
 

@@ -22,7 +22,7 @@ BESIDE_NO_FORCE = BESIDE_GRADIENT = (0.2, 0.5)  # times the error of the baselin
 BESIDE_TEXTBOOK = (0.95, 1.05)  # times the error of the better kernel that needs no training
 ENERGY = (0.03, 0.1)            # relative deviation from the truth
 SPECTRUM = (0.05, 0.2)          # rms of ln(E/E_filtered)
-DIVERGENCE = (0.002, 0.02)      # nats; normal distributions whose deviations differ by 4 % and 14 %
+DIVERGENCE = (0.002, 0.02)      # nats; as between normal distributions whose deviations differ by 4 % and 14 %
 FLOORS = (2.0, 5.0)             # times the error of samples of the truth itself
 LEAST_BASELINE = 0.1            # smallest error without any force for which velocities are judged
 KERNEL_WORDS = {GOOD: "better than", FAIR: "no improvement over", POOR: "worse than"}
@@ -99,10 +99,12 @@ def _sentences(numbers: Mapping[str, Any], judged: Sequence[Judged]) -> Iterator
         yield "There is no rollout to judge."
         return
     if not numbers.get("stable"):
-        yield f"Poor: the rollout did not reach its end ({numbers.get('status')}). Only earlier frames are compared."
+        status = numbers.get("status")
+        fault = "is not finite to its end" if status == "complete" else f"did not reach its end ({status})"
+        yield f"Poor: the rollout {fault}. Only earlier frames are compared."
     if not judged:
-        yield ("The rollout is not judged by the true tracers: its forcing differs from theirs, so they are in two "
-               "different flows." if numbers.get("two_flows") else "The rollout cannot be compared with the truth.")
+        yield ("The rollout is not judged against the true tracers: its forcing differs from theirs, so they are in "
+               "two different flows." if numbers.get("two_flows") else "The rollout cannot be compared with the truth.")
         return
     marked = {mark: [each.short for each in judged if each.mark == mark] for mark in (POOR, FAIR, GOOD)}
     worst_first = [f"{mark} in {', '.join(names)}" for mark, names in marked.items() if names]

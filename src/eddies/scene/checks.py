@@ -1,7 +1,7 @@
-"""The cross-checks of a scene: values that are allowed alone, but not side by side.
+"""The cross-checks of a scene: values that are allowed on their own, but not together.
 
-Each check compares some sections when a scene is made, before any work. It yields the key at fault, "section.key", and
-in words the reason and a remedy.
+Each check compares some sections when a scene is made, before any work. It yields pairs of the key at fault,
+"section.key", and a text with the reason and a remedy.
 """
 
 from __future__ import annotations
@@ -22,35 +22,36 @@ Problems = Iterator[tuple[str, str]]
 # Attributes that a user's class must have, by the key that names the class.
 REQUIRED = {"fluid": ("nonlinear", "linear", "linear_function", "combine", "compressible"), "kind": ("__call__",),
             "method": ("advance", "frame", "status", "series", "description", "has_density"), "network": ("forward",)}
-# Other names in a run directory, beside the products and directories of the stages.
+# Reserved names in a run directory, besides the products and checkpoint directories of the stages.
 RESERVED = ("report", "vtkhdf", "lagrangebench", "STOP", "LOCK")
 REALISATION = "realisation-"
 NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{,99}"
-# Keys that a variant must share with the scene, with the reason; STARTS: for rollouts that start after the training.
+# Keys that a variant must share with the scene, with the reason. STARTS: if rollouts start after the training window.
 SAME_TIMES = "all variants start at the same moment and are compared at the same times; change it for the whole scene"
-SAME_START = "rollouts start after it, and all must start at the same moment; give the scene a [simulation] start"
+SAME_START = ("rollouts start after the training window, and all must start at the same moment; give the scene a "
+              "[simulation] start")
 COMPARED = {**dict.fromkeys(("simulation.turnovers", "simulation.start", "simulation.frame_interval"), SAME_TIMES),
             "kernel.form": "all variants are measured alike; change it for the whole scene"}
 STARTS = dict.fromkeys(("training.window", "training.truths"), SAME_START)
 
 
 def check_names(name: str, seed: int, realisations: Sequence[int], has_rollouts: bool) -> Problems:
-    """A name that is no name of a directory, and seeds of realisations that are not new."""
+    """Yield problems of the name, which must be valid for a directory, and of the seeds of realisations."""
     if not re.fullmatch(NAME, name):
         yield "name", ('must be the name of a directory: at most 100 letters, digits, ".", "_" and "-", the first a '
                        'letter or a digit; choose another, such as "my-run_2"')
     if realisations and not has_rollouts:
-        yield "realisations", "the scene has no [simulation] to make rollouts on them; add it, or remove the key"
+        yield "realisations", "the scene has no [simulation], so no rollout uses them; add it, or remove the key"
     for other in realisations:
         if realisations.count(other) > 1:
             yield "realisations", f"{other} is given more than once; name each seed once"
         if other == seed:
-            yield "realisations", (f"{other} is the seed of the scene, whose ground truth models are trained on; leave "
-                                   "it out")
+            yield "realisations", (f"{other} is the seed of the scene, and models are trained on its ground truth; "
+                                   "leave this seed out")
 
 
 def problem_of_name(variant: str) -> str:
-    """The problem of the name of a variant; empty without one."""
+    """Return the problem with the name of a variant or of a set of tracers; empty if the name is valid."""
     if not re.fullmatch(NAME, variant) or "." in variant:
         return 'a name has at most 100 letters, digits, "_" and "-", the first a letter or a digit; choose another'
     reserved = {*RESERVED, *(name for stage in STAGES.values() for name in (stage.product, stage.checkpoints))}
@@ -60,7 +61,7 @@ def problem_of_name(variant: str) -> str:
 
 
 def check_foreign(flow: Flow, initial: Initial, simulation: Simulation | None, model: Model | None) -> Problems:
-    """Import paths that cannot be loaded, or whose class lacks an attribute. [model] checks the paths of terms."""
+    """Yield import paths that cannot be loaded, or whose class lacks an attribute. `Model` checks those of terms."""
     sections: dict[str, Section | None] = {"flow": flow, "initial": initial, "simulation": simulation}
     if model:
         sections |= {f"model.{name}": settings for name, settings in model.settings.items()}
@@ -79,7 +80,7 @@ def check_foreign(flow: Flow, initial: Initial, simulation: Simulation | None, m
 
 
 def check_flow(flow: Flow, initial: Initial, forcing: Forcing | None, model: Model | None) -> Problems:
-    """A sound speed, keys and waves that the fluid, the initial flow or the grid does not have."""
+    """Yield problems of the sound speed, of the initial flow and its keys, and of wavenumbers beyond the grid's."""
     if flow.compressible and flow.sound_speed is None:
         yield "flow.sound_speed", "this key is missing; a compressible fluid needs a number above 0"
     if not flow.compressible and flow.sound_speed is not None:
@@ -88,10 +89,10 @@ def check_flow(flow: Flow, initial: Initial, forcing: Forcing | None, model: Mod
         wanted = "an HDF5 file" if initial.flow.from_file else "a text file"
         yield "initial.path", f'this key is missing; kind = "{initial.kind}" needs the path of {wanted}'
     if initial.flow.sound and not flow.compressible:
-        yield "initial.kind", 'needs sound; set [flow] fluid = "compressible"'
+        yield "initial.kind", 'sound needs a compressible fluid; set [flow] fluid = "compressible"'
     if model and initial.flow.steady and flow.viscosity == 0 and forcing is None:
-        yield "initial.kind", ("without viscosity this flow has no acceleration, which models are made dimensionless "
-                               "with; choose another kind, or raise [flow] viscosity")
+        yield "initial.kind", ("without viscosity this flow has no acceleration, but a model needs one as its unit; "
+                               "choose another kind, or raise [flow] viscosity")
     for key in InitialFlow().keys:
         if key not in initial.flow.keys and getattr(initial, key) != type(initial).__dataclass_fields__[key].default:
             kinds = [kind for kind, each in INITIAL_FLOWS.items() if key in each.keys]
@@ -107,7 +108,7 @@ def check_flow(flow: Flow, initial: Initial, forcing: Forcing | None, model: Mod
 
 def check_time(time: Time, flow: Flow, forcing: Forcing | None, spin_up: SpinUp | None,
                tracers: Tracers | None) -> Problems:
-    """A missing or second run time, and a forcing that never acts."""
+    """Yield a run time that is missing or given twice, an impossible stationary span, and forcing that never acts."""
     if tracers is None and time.duration is None:
         yield "time.duration", "this key is missing; without [tracers] it is the run time, a number above 0"
     if tracers is not None and time.duration is not None:
@@ -127,10 +128,10 @@ def check_time(time: Time, flow: Flow, forcing: Forcing | None, spin_up: SpinUp 
 
 
 def check_tracers(tracers: Tracers, flow: Flow, initial: Initial) -> Problems:
-    """A flow at rest, and stored fields finer than the flow."""
+    """Yield an initial flow at rest, and stored fields on a finer grid than the flow's."""
     if initial.flow.sound:
-        yield "initial.kind", ("starts from rest and has no turnover time, in which [tracers] turnovers are counted; "
-                               "choose another kind, or remove [tracers]")
+        yield "initial.kind", ("starts from rest and has no turnover time, the unit of [tracers] turnovers; choose "
+                               "another kind, or remove [tracers]")
     for name, each in (tracers.sets or {"": tracers}).items():
         if each.cells > flow.cells:
             key = f"set {name}: field_cells " if name else ""
@@ -140,15 +141,15 @@ def check_tracers(tracers: Tracers, flow: Flow, initial: Initial) -> Problems:
 
 
 def check_filtered(tracers: Tracers, present: Collection[str]) -> Problems:
-    """Particles of the whole flow in a scene that learns from them or rolls them out."""
+    """Yield tracers of the unfiltered velocity in a scene with a kernel, a model or a rollout."""
     made = [f"[{name}]" for name in ("kernel", "model", "training", "simulation") if name in present]
     if not tracers.filtered and made:
-        yield "tracers.filtered", ("these particles follow the whole flow, but kernels, models and rollouts are those "
-                                   f"of a filtered velocity; choose another set, or remove {', '.join(made)}")
+        yield "tracers.filtered", ("these particles follow the unfiltered velocity, but kernels, models and rollouts "
+                                   f"need the filtered one; choose another set, or remove {', '.join(made)}")
 
 
 def check_sets(tracers: Tracers, variants: Collection[str]) -> Problems:
-    """Names of sets of tracers that are no names of directories, or those of variants."""
+    """Yield names of sets of tracers that are not valid directory names, or are also names of variants."""
     for name in tracers.sets:
         problem = problem_of_name(name) or name in variants and "a variant has this name; choose another"
         if problem:
@@ -156,16 +157,16 @@ def check_sets(tracers: Tracers, variants: Collection[str]) -> Problems:
 
 
 def check_reach(section: str, neighbors: float, tracers: Tracers, skin: float) -> Problems:
-    """A support of the kernel, or a radius of interaction, beyond half the cube."""
+    """Yield a kernel support or a radius of interaction that is, with the skin, half the cube or more."""
     reach = tracers.radius_of(neighbors) * (1 + skin)
     if reach >= math.pi:  # a particle would see another one and its image
         yield f"{section}.neighbors", (
-            f"{tracers.particles} particles reach {reach:.3g} with the skin, and half the cube is {math.pi:.3g}; "
+            f"with {tracers.particles} particles the radius and skin are {reach:.3g}, half the cube is {math.pi:.3g}; "
             "lower neighbors or raise [tracers] particles_per_side")
 
 
 def check_needs(present: Collection[str], needs_model: bool, has_weights: bool) -> Problems:
-    """Missing sections that others need."""
+    """Yield sections that need a section which is missing."""
     needs = {"kernel": "tracers", "reconstruction": "tracers", "model": "tracers", "training": "model",
              "simulation": "model" if needs_model else "tracers"}
     for name, other in needs.items():
@@ -177,7 +178,7 @@ def check_needs(present: Collection[str], needs_model: bool, has_weights: bool) 
 
 
 def check_density(flow: Flow, model: Model | None, simulation: Simulation | None) -> Problems:
-    """A density that is given twice, and one that is read but not given by the terms or the flow."""
+    """Yield a density that is given twice, given but not read, or read but not given by the terms or the flow."""
     incompressible, rates = not flow.compressible, {"density", "density_rate"}
     remedy = 'or set [flow] fluid = "compressible" and sound_speed'
     settings = model.settings if model else {}
@@ -185,18 +186,18 @@ def check_density(flow: Flow, model: Model | None, simulation: Simulation | None
     if rates <= gives:
         first, second = (next(name for name, one in settings.items() if kind in one.gives)
                          for kind in ("density", "density_rate"))
-        yield "model.terms", (f'"{first}" gives the density and "{second}" its rate, which are two densities; remove '
-                              "one of the two")
+        yield "model.terms", (f'"{first}" gives the density and "{second}" gives its rate, so it is given twice; '
+                              "remove one of the two")
     for name, one in settings.items():
         leave = (f'leave "density" out of [model.{name}] inputs' if "density" in getattr(one, "inputs", ()) else
                  f'remove "{name}"')
         if "density" in one.reads and "density" in one.gives:
             yield "model.terms", f'"{name}" both reads and gives the density; it can do only one of the two'
         if "density" not in reads and rates >= {*one.gives}:
-            yield "model.terms", (f'"{name}" gives the density alone, which no term reads; remove it, or add a term '
-                                  "that does")
+            yield "model.terms", (f'"{name}" gives only the density, which no term reads; remove it, or add a term '
+                                  "that reads it")
         if "density" in one.reads and not rates & gives:
-            yield "model.terms", (f'"{name}" reads the density, which no term gives; add a term that does, such as '
+            yield "model.terms", (f'"{name}" reads the density, which no term gives; add one that gives it, such as '
                                   f'"pressure" or "continuity", or {leave}')
         if "density" in one.reads and incompressible:
             yield f"model.{name}", f"reads the density, which an incompressible flow does not have; {leave}, {remedy}"
@@ -209,10 +210,10 @@ def check_density(flow: Flow, model: Model | None, simulation: Simulation | None
 
 
 def check_training(training: Training, tracers: Tracers | None, kernel: Kernel | None) -> Problems:
-    """Steps, rates and weights that contradict each other."""
+    """Yield steps, learning rates, frames and weights that contradict each other."""
     if training.combined_steps > training.steps:
-        yield "training.combined_steps", (f"must be at most steps = {training.steps}, because these are the last of "
-                                          "the steps; lower it")
+        yield "training.combined_steps", (f"must be at most steps = {training.steps}, because the combined steps are "
+                                          "the last of all steps; lower it")
     for section, part in {"": training, "[training.horizons] ": training.horizons}.items():
         if part is not None and training.final_learning_rate > part.learning_rate:
             yield "training.final_learning_rate", f"must be at most {section}learning_rate = {part.learning_rate:g}"
@@ -224,14 +225,15 @@ def check_training(training: Training, tracers: Tracers | None, kernel: Kernel |
     if truths == ():
         yield "training.truths", "is empty; name one or more run directories, or remove the key"
     if truths and training.frames < 2 * len(truths):
-        yield "training.frames", f"the {len(truths)} truths need 2 each, {2 * len(truths)} in all; raise it"
+        yield "training.frames", f"the {len(truths)} truths need 2 frames each, {2 * len(truths)} in all; raise it"
     if tracers and training.batch > tracers.particles:
         yield "training.batch", (f"must be at most the number of particles, {tracers.particles}; lower it or raise "
                                  "[tracers] particles_per_side")
     if training.field_weight > 0 and kernel is None:
         yield "training.field_weight", "this loss needs a section [kernel], which is missing; add it, or remove the key"
     if training.field_target == "flow" and training.field_weight == 0:
-        yield "training.field_target", "applies to the field loss, whose weight is 0; set field_weight, or remove it"
+        yield "training.field_target", ("applies to the field loss, whose weight is 0; set field_weight, or remove the "
+                                        "key")
     later = training.field_weight + training.velocity_kl_weight + training.acceleration_kl_weight
     if (later > 0) != (training.combined_steps > 0):
         yield "training.combined_steps", (
@@ -240,7 +242,7 @@ def check_training(training: Training, tracers: Tracers | None, kernel: Kernel |
 
 
 def check_simulation(simulation: Simulation, tracers: Tracers, seen: float) -> Problems:
-    """Frames at times without a step or without a frame of the ground truth, and a missing start.
+    """Yield a frame interval that is no multiple of the step or of that of the tracers, and a missing start.
 
     `seen` is the fraction of the ground truth that training has used.
     """
@@ -259,19 +261,22 @@ def check_simulation(simulation: Simulation, tracers: Tracers, seen: float) -> P
 
 
 def check_coarse_grid(eulerian: Eulerian | None, cells: int, flow: Flow, model: Model | None) -> Problems:
-    """A coarse grid that is not used, is finer than the flow, or lacks sound or damping rates. `cells` along a side is
-    0 without a coarse grid."""
+    """Yield problems of a coarse grid: not used, finer than the flow, without sound speed, or without damping rates.
+
+    `cells` is the number of its cells along a side, 0 without a coarse grid.
+    """
     if eulerian is None:
         eulerian = Eulerian()
     elif not cells:
         yield "eulerian", 'only read with [simulation] method = "eulerian"; set it, or remove [eulerian]'
     if cells > flow.cells:
-        yield "eulerian.cells", f"must be at most the {flow.cells} of the flow that it starts from; lower cells"
+        yield "eulerian.cells", (f"must be at most [flow] cells = {flow.cells}, because the coarse grid starts from "
+                                 "that flow; lower it")
     if eulerian.form.learned and model and not model.damping:
         yield "eulerian.closure", ('takes the rates of the term "damping", which [model] lacks; add it to its terms, '
                                    "or choose another closure")
     if eulerian.compressible and not flow.compressible:
-        yield "eulerian.fluid", "[flow] fluid is incompressible and has no sound speed; set both to the same"
+        yield "eulerian.fluid", "[flow] fluid is incompressible and gives no sound speed; set both to the same fluid"
 
 
 def _is_multiple(interval: float, unit: float) -> bool:

@@ -1,4 +1,4 @@
-"""The time stepping schemes of particles: cost, order and stability of a step, known without torch."""
+"""The time stepping schemes of particles: cost and stability of a step. This module does not need torch."""
 
 from dataclasses import dataclass
 
@@ -10,28 +10,27 @@ MOST_COURANT = 1.4
 class Scheme:
     """A scheme that a scene can name.
 
-    `nodes` and `weights` are c and b of a Runge-Kutta scheme whose stages start at the beginning of the step, each
-    along the rates of the stage before; other schemes have none. `angle` and `iterations`: see docs/closure.md.
+    `nodes` and `weights` are c and b of a Runge-Kutta scheme whose stages all advance from the beginning of the step,
+    each with the rates of the stage before; other schemes have none. `angle` and `iterations`: see docs/closure.md.
     """
 
     name: str
-    order: int  # of the error in the step
     evaluations: int  # of the rates in a step
     dense: bool = True  # it can interpolate between steps; if not, frames lie at ends of steps
-    angle: float  # largest k_c u' dt with which a velocity resolved up to k_c follows the flow
-    decay: float  # largest rate of relaxation times step
-    iterations: float  # of the solve for a resolved velocity in an evaluation, at about the longest steps
+    angle: float  # largest k_c u' dt at which a velocity resolved up to k_c follows the flow
+    decay: float  # largest product of rate of relaxation and step
+    iterations: float  # of the solve for a resolved velocity, per evaluation, at about the longest step
     nodes: tuple[float, ...] = ()
     weights: tuple[float, ...] = ()
 
 
 SCHEMES = {scheme.name: scheme for scheme in (
-    Scheme(name="verlet", order=2, evaluations=1, dense=False, angle=0.5, decay=1.0, iterations=1.0),
-    Scheme(name="corrected-verlet", order=2, evaluations=2, angle=0.5, decay=2.0, iterations=1.0),
-    Scheme(name="rk2", order=2, evaluations=2, angle=1.2, decay=2.0, iterations=1.2, nodes=(0, 1 / 2), weights=(0, 1)),
+    Scheme(name="verlet", evaluations=1, dense=False, angle=0.5, decay=1.0, iterations=1.0),
+    Scheme(name="corrected-verlet", evaluations=2, angle=0.5, decay=2.0, iterations=1.0),
+    Scheme(name="rk2", evaluations=2, angle=1.2, decay=2.0, iterations=1.2, nodes=(0, 1 / 2), weights=(0, 1)),
     # Heun's scheme: its stages are a third of a step apart, which suits a solve that starts from an extrapolation.
-    Scheme(name="rk3", order=3, evaluations=3, angle=1.2, decay=2.51, iterations=3.0, nodes=(0, 1 / 3, 2 / 3),
+    Scheme(name="rk3", evaluations=3, angle=1.2, decay=2.51, iterations=3.0, nodes=(0, 1 / 3, 2 / 3),
            weights=(1 / 4, 0, 3 / 4)),
-    Scheme(name="rk4", order=4, evaluations=4, angle=1.6, decay=2.78, iterations=6.5, nodes=(0, 1 / 2, 1 / 2, 1),
+    Scheme(name="rk4", evaluations=4, angle=1.6, decay=2.78, iterations=6.5, nodes=(0, 1 / 2, 1 / 2, 1),
            weights=(1 / 6, 1 / 3, 1 / 3, 1 / 6)),
 )}

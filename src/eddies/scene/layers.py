@@ -1,7 +1,7 @@
 """The layers of a scene: its base, its own file, a variant, the command line.
 
-All layers are one operation on the keys of a TOML document: first some keys or sections are removed, then others are
-set. The order is base, scene, variant, command line.
+Each layer changes the keys of a TOML document in the same way: first it removes some keys or sections, then it sets
+others. The order is base, scene, variant, command line.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ VARIANT = "variant"
 OF_FILES = ("base", "unset")  # keys that only a file may have
 FILE_KEYS = {"initial": ("path",), "tracks": ("path",), "model": ("path",), "training": ("truths",),
              "simulation": ("step_from", "confirmed_on")}
-DEEPEST = 3  # parts of a dotted key: [section.sub.key], and the same in [variant.NAME]
+DEEPEST = 3  # most parts of a dotted key, section.sub.key; two more in [variant.NAME]
 
 Document = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Layer:
-    """Changes of a document.
+    """Changes to a document.
 
     Parameters
     ----------
     values : new values by dotted key, such as "flow.cells"; an empty table makes an absent section.
-    unset : dotted keys and sections that are removed before.
+    unset : dotted keys and sections that are removed first.
     """
 
     values: Mapping[str, Any]
@@ -59,7 +59,7 @@ class Layer:
     def apply(self, document: Document) -> None:
         """Change the document in place.
 
-        Raises SceneError for a removal of a key that the document lacks, and for a key below a value.
+        Raises SceneError if a key to remove is missing, or if a key belongs to a section that is a value.
         """
         for removal in self.unset:
             self._remove(document, removal)
@@ -104,7 +104,7 @@ def with_sections(key: str) -> Iterator[str]:
 
 
 def read_document(name_or_path: str, above: Sequence[Path] = ()) -> tuple[Path, Document]:
-    """Return the file of a scene, and its document laid over its bases. `above` are the files that have it as a base.
+    """Return the file of a scene, and its document merged over its bases. `above` are the files that have it as a base.
 
     Variants of a scene replace those of its base. Raises SceneError if there is no such scene, a file is not TOML, or a
     scene is its own base.
@@ -136,7 +136,7 @@ def read_document(name_or_path: str, above: Sequence[Path] = ()) -> tuple[Path, 
 
 
 def _find(name_or_path: str, beside: Path | None) -> Path:
-    """The file of a built-in scene, or of a path, from the folder `beside` or else from the working directory."""
+    """The file of a built-in scene, or of a path relative to the folder `beside` or else to the working directory."""
     names = sorted(path.stem for path in BUILT_IN.glob("*.toml"))
     if name_or_path in names:
         return BUILT_IN / f"{name_or_path}.toml"
@@ -155,7 +155,7 @@ def _find(name_or_path: str, beside: Path | None) -> Path:
 
 
 def _find_files(document: Document, folder: Path) -> None:
-    """Replace relative paths in a document, of files that exist beside the scene and not in the working directory."""
+    """Replace the relative paths of files that exist beside the scene but not in the working directory."""
     def found(path: str) -> str:
         beside = os.path.abspath(folder / path)
         return beside if not os.path.exists(path) and os.path.exists(beside) else path
@@ -174,14 +174,14 @@ def _find_files(document: Document, folder: Path) -> None:
 def _parse(path: Path) -> Document:
     """The tables and keys of a TOML file. Raises SceneError, with the line at fault, if it cannot be read."""
     try:
-        # Some editors begin a file with a mark of its encoding.
+        # Some editors begin a file with a byte order mark.
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except RecursionError:
-        raise SceneError("is no scene: its brackets are nested too deep; values have at most two levels") from None
+        raise SceneError("is not a scene: its brackets are nested too deep; values have at most two levels") from None
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise SceneError(f"cannot be read: {reason}; give the path of a scene, a TOML file") from None
-    except ValueError as error:  # of TOML, or of a number with thousands of digits
+    except ValueError as error:  # from TOML, or from a number with thousands of digits
         raise SceneError(f"not TOML: {error}; keys are written `key = value` under a [section]") from None
 
 
@@ -197,7 +197,7 @@ def command_line(overrides: Sequence[str], removals: Sequence[str]) -> Layer:
         most = DEEPEST + 2 if names[0] == VARIANT else DEEPEST
         if not equals or not value or len(names) > most or not all(names):
             raise SceneError(f"--set {shortened(override)}: must be section.key=value, or key=value outside sections, "
-                             "or section.name.key=value in a section of a section; for one variant, "
+                             "or section.name.key=value in a nested section; for one variant, "
                              "variant.NAME.section.key=value")
         if key in OF_FILES:
             raise SceneError(f"--set {shortened(override)}: {key} can only be set in a file; "
@@ -226,7 +226,7 @@ def check_command_line(given: Layer, variants: Mapping[str, Layer], existing: It
                 check_variant(rest.partition(".")[0], existing, key)
             for name, layer in variants.items() if first != VARIANT else ():
                 if any(f"{own}.".startswith(f"{key}.") for own in (*layer.values, *layer.unset)):
-                    raise SceneError(f'{option} {key}: the variant "{name}" changes this key itself; reach it by '
+                    raise SceneError(f'{option} {key}: the variant "{name}" changes this key itself; use '
                                      f"{option} {VARIANT}.{name}.{key}" + ("=..." if option == "--set" else ""))
 
 

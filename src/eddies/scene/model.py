@@ -23,20 +23,20 @@ def weights_that_come_along() -> list[str]:
 
 @dataclass(frozen=True, kw_only=True)
 class Model(Section):
-    """The terms whose sum moves the particles, each with its settings; a preset is a list of terms with a name.
+    """The terms whose sum moves the particles, each with its settings; a preset is a named list of terms.
 
     When the section is made, the preset gives `terms` and the absent keys of their `settings`, and becomes None. A
     program gives settings as objects or as dicts.
     """
 
-    preset: str | None = choice(f"a list of terms with a name; absent: {DEFAULT_PRESET}, if there are no terms",
+    preset: str | None = choice(f"name of a predefined list of terms; absent: {DEFAULT_PRESET}, unless terms is given",
                                 *PRESETS, default=None)
-    terms: tuple[str, ...] | None = texts("names of the terms that accelerate the particles and give their density, "
-                                          "each with the keys of [model.NAME]", *TERMS, default=None, paths=True)
-    neighbors: float | None = number("mean number of particles within the radius of interaction, with terms that read "
-                                     "pairs; absent: as in [kernel], or 60", default=None, at_least=8)
-    path: str | None = text("run directory or model.h5 whose trained weights are used, or \"eddies:NAME\", those of a "
-                            "built-in scene that come with the package; absent: they are trained", default=None)
+    terms: tuple[str, ...] | None = texts("names of the terms that give the acceleration and density of the particles; "
+                                          "[model.NAME] has the keys of each", *TERMS, default=None, paths=True)
+    neighbors: float | None = number("mean number of particles within the radius of interaction, only with terms that "
+                                     "read pairs; absent: as in [kernel], or 60", default=None, at_least=8)
+    path: str | None = text("run directory or model.h5 with the trained weights to use, or \"eddies:NAME\" for those "
+                            "of a built-in scene in the package; absent: the weights are trained", default=None)
     settings: dict[str, TermSettings] = sections()
     _holder: ClassVar[str] = "settings"
 
@@ -69,7 +69,7 @@ class Model(Section):
 
     @property
     def weights_file(self) -> Path | None:
-        """The file of the weights that `path` names; None without it."""
+        """The file of the weights that `path` names; None without `path`."""
         if self.path is None or not self.path.startswith(COME_ALONG):
             return None if self.path is None else product_file(self.path, "train")
         return WEIGHTS / f"{self.path.removeprefix(COME_ALONG)}.h5"
@@ -86,7 +86,7 @@ class Model(Section):
 
     @property
     def damping(self) -> str | None:
-        """The parameter "NAME.rates" of a term with rates of damping that a coarse grid can take; None without one."""
+        """The parameter "NAME.rates" of a term whose damping rates a coarse grid can use; None without such a term."""
         return next((f"{name}.{one.damps_by}" for name, one in self.settings.items() if one.damps_by), None)
 
     @property
@@ -115,7 +115,7 @@ def replace_terms(table: dict[str, Any], keys: set[str]) -> None:
 def settings_class(term: str) -> type[TermSettings]:
     """Return the class of a term's settings: a class of this package, or `Settings` of a user's class.
 
-    Raises ImportPathError for a wrong import path, SceneError for a class that is no term or has unfit Settings.
+    Raises ImportPathError for a wrong import path, SceneError if the class is not a term or its Settings are not valid.
     """
     if not is_path(term):
         return TERMS[term]
@@ -139,8 +139,8 @@ def _settings(term: str, name: str, preset: Mapping[str, Any],
         raise SceneError(f"[model] terms: {error}", "model.terms") from None
     if isinstance(given, Section):
         if type(given) is not kind:
-            raise SceneError(f"[model.{name}]: must be settings of the class {kind.__qualname__}, or a dict of its "
-                             f"keys, not of {type(given).__qualname__}", f"model.{name}")
+            raise SceneError(f"[model.{name}]: must be settings of the class {kind.__qualname__} or a dict of its "
+                             f"keys, not settings of the class {type(given).__qualname__}", f"model.{name}")
         made = given
     else:
         made = read_section(kind, {**preset, **given} if isinstance(given, Mapping) else given, f"model.{name}")

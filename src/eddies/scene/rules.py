@@ -1,4 +1,4 @@
-"""The rule of one key: what it means and which values it may have. Also how errors and files write values."""
+"""The rule of one key: its meaning and its allowed values. Also the form of values in errors and files."""
 
 import dataclasses
 import difflib
@@ -13,7 +13,7 @@ from typing import Any
 IMPORT_PATH = 'the import path "module:name" of your own'
 # Bounds of numbers and of whole numbers: beyond them squares and cubes overflow, or a run does not end.
 SMALLEST, LARGEST, MOST = 1e-15, 1e15, 10**9
-# Most characters of a value in an error; most bits of a whole number that is written with decimals.
+# Most characters of a value in an error; most bits of a whole number that is written in decimal.
 SHOWN, MOST_BITS = 60, 10_000
 
 
@@ -47,7 +47,7 @@ class Rule:
     kind : type of the value, or of each entry of a list: float, int, bool or str.
     about : meaning of the key in one line.
     bounds : interval of a number.
-    words : strings that are allowed, beside numbers or alone; without any a string may be any text.
+    words : allowed strings, besides numbers or alone; if there are none, any string is allowed.
     paths : whether the import path "module:name" of a user's own class is allowed too.
     many : whether the value is a list, held as a tuple.
     """
@@ -62,7 +62,7 @@ class Rule:
     def accept(self, value: Any) -> Any:
         """Return the value in the form in which a section holds it.
 
-        Raises ValueError, with a hint where there is one, for a value that is not allowed.
+        Raises ValueError, whose text is a hint or empty, if the value is not allowed.
         """
         if not self.many:
             return self._accept_one(value)
@@ -77,12 +77,13 @@ class Rule:
         if self.kind is bool:
             return "true or false"
         if self.kind is str and not words:
-            return 'a list of texts, such as ["one", "two"]' if self.many else "a text in quotes"
+            return 'a list of strings, such as ["one", "two"]' if self.many else "a string in quotes"
         if self.kind is str:
             return ("a list of any of " if self.many else "one of ") + ", ".join(words) + (
                 f", or {IMPORT_PATH}" if self.paths else "")
         if self.many:
-            return f"a list such as [16, 16] of whole numbers, each {self.bounds}".removesuffix(", each ")
+            entries = "[16, 16] of whole numbers" if self.kind is int else "[0.5, 1.5] of numbers"
+            return f"a list such as {entries}, each {self.bounds}".removesuffix(", each ")
         noun = "a whole number" if self.kind is int else "a number"
         return " or ".join([f"{noun} {self.bounds}".rstrip(), *words])
 
@@ -120,13 +121,13 @@ class Rule:
 
 
 def nearest(given: str, valid: Iterable[str], cutoff: float = 0.6) -> str:
-    """Return the hint "did you mean ...? " with the nearest valid spelling, before a text; empty if none is near."""
+    """Return the hint "did you mean ...? " with the nearest valid spelling; empty if none is near."""
     near = difflib.get_close_matches(given, list(valid), n=1, cutoff=cutoff)
     return f"did you mean {near[0]}? " if near else ""
 
 
 def shortened(text: str) -> str:
-    """Return the beginning of a long text, for an error."""
+    """Return a text for an error, cut off if it is long."""
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}... ({len(text)} characters)"
 
 

@@ -30,29 +30,29 @@ __all__ = ["BOX_LENGTH", "REALISATION", "Scene", "SceneError", "builtin_scenes",
 REALISATION = checks.REALISATION
 # The keys of a scene that a variant cannot change.
 OF_THE_WHOLE = ("name", "base", "realisations", VARIANT)
-# The sections that may name classes and functions of the user's.
+# The sections that may name classes and functions of the user.
 FOREIGN_IN = ("flow", "initial", "model", "simulation")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scene(Section):
-    """A whole scene; making one checks its values and that its sections fit together (SceneError).
+    """A whole scene. The constructor checks its values and whether its sections fit together (SceneError).
 
     A scene with [tracks] gets the sections `flow` and `tracers` from the file with the tracks, when it is run
-    (`workflows.tracks.with_tracks`); before they are None, and the sections are not compared.
+    (`workflows.tracks.with_tracks`); before that they are None, and the cross-checks are left out.
 
-    `variant` has the scenes of the variants by name, each whole and without variants of its own.
+    `variant` maps the names of the variants to their scenes, which are complete and have no variants of their own.
     """
 
-    name: str = text("names the run; absent: the file's name", default="scene")
+    name: str = text("name of the run; absent: the file's name", default="scene")
     title: str = text("one line for lists and reports", default="untitled scene")
     label: str | None = text("name of the variant in tables and figures; absent: NAME of [variant.NAME]", default=None)
-    seed: int = integer("seed of every random number", default=1, at_least=0, at_most=10**18)
+    seed: int = integer("seed of all random numbers", default=1, at_least=0, at_most=10**18)
     realisations: tuple[int, ...] | None = integers(
-        "seeds of further ground truths, which no training sees: rollouts are made on each from its beginning; a flow "
-        "of kind file starts from the realisation of the same seed beside its file; absent: on "
-        "the ground truth of the scene, after the training window", default=None, at_least=0)
-    device: str = choice("where particles are computed", "cpu", "cuda", default="cpu")
+        "seeds of further ground truths, which no training uses; rollouts are made on each, from its beginning; an "
+        "initial flow of kind file is read from realisation-SEED beside its file; absent: rollouts are made on the "
+        "ground truth of the scene, after the training window", default=None, at_least=0)
+    device: str = choice("device that computes the particles", "cpu", "cuda", default="cpu")
     tracks: Tracks | None = section(Tracks, default=None)
     flow: Flow = section(Flow, default=None)
     initial: Initial = section(Initial, default=Initial())
@@ -77,7 +77,7 @@ class Scene(Section):
 
     @classmethod
     def section_name(cls) -> str:
-        """Empty: the keys of a scene are outside all sections."""
+        """Return an empty name, because the keys of a scene are outside all sections."""
         return ""
 
     @property
@@ -88,7 +88,7 @@ class Scene(Section):
     def realisation(self, seed: int) -> "Scene":
         """The scene with another seed.
 
-        A flow that starts from a ground truth starts from the realisation of this seed in the same run directory.
+        An initial flow of kind file is read from the file of the same name in realisation-SEED beside it.
         """
         start = self.initial
         if start.flow.from_file and start.file is not None:
@@ -109,7 +109,7 @@ class Scene(Section):
 
     @property
     def sets(self) -> Mapping[str, Tracers]:
-        """The sets of tracers by name; none with one kind of tracers."""
+        """The sets of tracers by name; empty without sections [tracers.NAME]."""
         return self.tracers.sets if self.tracers else {}
 
     @property
@@ -123,7 +123,7 @@ class Scene(Section):
     def stages(self) -> tuple[str, ...]:
         """The stages that this scene asks for, in the order in which they run.
 
-        Tracers of several sets only have ground truths: a scene must choose a set for the other stages.
+        With several sets of tracers these are only "dns" and "report": the others need a scene that chooses a set.
         """
         if self.sets:
             return "dns", "report"
@@ -162,7 +162,7 @@ class Scene(Section):
 
     @property
     def duration(self) -> float | None:
-        """How long the direct simulation goes on after its spin-up: turnovers with tracers, a time without them."""
+        """Length of the direct simulation after its spin-up: in turnovers with tracers, else in units of time."""
         return self.tracers.turnovers if self.tracers is not None else self.time.duration
 
     @property
@@ -173,7 +173,7 @@ class Scene(Section):
     def seen_in(self, directory: Path) -> float:
         """Fraction of the ground truth of a run directory that the model is trained on.
 
-        It is 0 without [training], and where [training] truths names only other ground truths.
+        It is 0 without [training], and if [training] truths names only other ground truths.
         """
         if self.training is None:
             return 0.0
@@ -261,7 +261,7 @@ class Scene(Section):
                                          f"{seed} from realisations")
 
     def _problems(self) -> checks.Problems:
-        """Yield the problems of names, of sections side by side, and of variants, each with the key at fault."""
+        """Yield the problems of names, of sections that do not fit together, and of variants, each with its key."""
         flow, tracers, kernel, model, simulation = self.flow, self.tracers, self.kernel, self.model, self.simulation
         present = {field.name for field in fields(self) if getattr(self, field.name) is not None}
         yield from checks.check_names(self.name, self.seed, self.realisations or (), bool(simulation or self.variant))
@@ -351,7 +351,7 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = (), removals
     """Read a scene with its variants: a built-in one by name, or a TOML file by path.
 
     First the `removals` "section.key" or "section" are taken out, then the `overrides` "section.key=value" are set.
-    Modules of the user's classes are searched in Python's own folders, then beside the file, then in the working
+    Modules of the user's classes are looked for in Python's own folders, then beside the file, then in the working
     directory.
 
     Raises SceneError, with the file (or --set, --unset), the section, the key, the allowed values, and a remedy.
@@ -397,5 +397,5 @@ def _variant(document: dict[str, Any], name: str, layer: Layer) -> Scene:
 
 
 def builtin_scenes() -> list[tuple[str, str]]:
-    """Return name and title of every scene that comes with the package, by name."""
+    """Return name and title of every scene that comes with the package, in order of name."""
     return [(path.stem, read_document(path.stem)[1]["title"]) for path in sorted(BUILT_IN.glob("*.toml"))]

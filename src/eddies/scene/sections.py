@@ -22,7 +22,7 @@ from eddies.scene.values import (KeyProblem, SceneError, Section, boolean, choic
 
 BOX_LENGTH = 2 * math.pi
 DEFAULT_WINDOW = 0.5
-# Cells along a side of the cube: twice those of the largest direct simulations.
+# Most cells along a side of the cube: twice as many as in the largest direct simulations.
 MOST_CELLS = 65536
 # Default mean number of particles within a support or a radius of interaction, as in the paper.
 NEIGHBORS = 60.0
@@ -68,11 +68,11 @@ class InitialFlow:
     peak: float | None = None  # largest |u| + |v| + |w| over the amplitude; None: unknown, or at rest
     turbulent: bool = False  # it has many scales, with the spectrum's peak at `peak_wavenumber`
     sound: bool = False  # at rest except for sound waves
-    steady: bool = False  # without viscosity nothing in it accelerates
+    steady: bool = False  # without viscosity it has no acceleration
 
     @property
     def from_file(self) -> bool:
-        """Whether it comes from a file."""
+        """Whether it is a stored state, read from a file."""
         return self.keys == ("path", "state")
 
 
@@ -92,18 +92,18 @@ class Initial(Section):
     """The velocity, and with a compressible fluid the density, at time 0."""
 
     kind: str = named("initial flow", *INITIAL_FLOWS, default="random")
-    amplitude: float = number("amplitude of the velocity; random: rms of a component; sound-wave: that of ln density",
+    amplitude: float = number("amplitude of the velocity; random: rms of a component; sound-wave: of ln density",
                               default=1.0, above=0)
     peak_wavenumber: float = number("wavenumber of the spectrum's peak, random only", default=3.0, at_least=0.1)
     wavenumber: int = integer("number of waves in the cube; abc, shear-wave, sound-wave only", default=1, at_least=1)
     path: str | None = text("file to start from, on any grid: ground_truth.h5 or its run directory, JHTDB cutout or "
                             "fluidsim state; kind spectrum: a text file with k and E(k) in each line", default=None)
-    state: int = integer("index in time of the state in this file: fields/final, with tracers fields/unfiltered, in a "
-                         "cutout velocity_####", default=0, at_least=0)
+    state: int = integer("index in time of the state in this file; it is in fields/final, with tracers in "
+                         "fields/unfiltered, in a cutout in velocity_####", default=0, at_least=0)
 
     @property
     def file(self) -> Path | None:
-        """The file to start from; of a run directory, its ground truth."""
+        """The file to start from; for a run directory, its ground truth."""
         if self.path is None:
             return None
         path = expanded(self.path)
@@ -117,33 +117,33 @@ class Initial(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class Tracks(Section):
-    """Measured particle tracks, in the place of the direct simulation and its tracers.
+    """Measured particle tracks, used in place of the direct simulation and its tracers.
 
-    Lengths have the unit of the file, and velocities that length over the unit of `time_unit`. In the run the edge of
-    the box is 2 pi, and the unit of time stays. Fields are made from all tracks of a frame; models take those that are
-    there in all frames.
+    Lengths are in the unit of the file, and times in the time unit of its velocities. In the run the edge of the box is
+    2 pi, and the unit of time is the same. Fields are made from all tracks of a frame; models use only the tracks that
+    are present in all frames.
     """
 
     path: str = text("file with the tracks")
-    format: str | None = choice("layout of the file (docs/tracks.md); absent: by its name and content", "h5md", "npz",
-                                "lagrangebench", "csv", default=None)
+    format: str | None = choice("layout of the file (docs/tracks.md); absent: found from its name and content", "h5md",
+                                "npz", "lagrangebench", "csv", default=None)
     group: str | None = text("name of the particles or of the trajectory in a file with several", default=None)
     box: float | None = number("edge of the periodic cube; absent: that of the file", default=None, above=0)
     volume: tuple[float, ...] | None = numbers("x0, x1, y0, y1, z0, z1 of a volume that is not periodic, in place of "
                                                "box", default=None)
     margin: float | None = number("distance between the volume and its image in the periodic cube around it; absent: "
                                   "four mean spacings", default=None, above=0)
-    time_unit: float = number("length of the file's unit of time, in the time unit of velocities", default=1.0, above=0)
+    time_unit: float = number("the file's unit of time, in the time unit of its velocities", default=1.0, above=0)
     interval: float | None = number("time between frames, for an npz file without times", default=None, above=0)
-    filtered: bool = boolean("whether the particles follow a filtered velocity; false: that of the whole flow",
+    filtered: bool = boolean("whether the particles follow a filtered velocity; false: the unfiltered one",
                              default=False)
     filter_width: float | None = number("width of the Gaussian filter; absent: twice the mean spacing", default=None,
                                         above=0)
     viscosity: float | None = number("kinematic viscosity, for terms that need it", default=None, above=0)
     sound_speed: float | None = number("speed of sound, for terms that need the density; the file must have densities",
                                        default=None, above=0)
-    noise: float = number("standard deviation of a measured coordinate", default=0.0, at_least=0)
-    field_every: int = integer("number of frames per reconstructed field", default=5, at_least=1)
+    noise: float = number("standard deviation of the error of a measured coordinate", default=0.0, at_least=0)
+    field_every: int = integer("interval between reconstructed fields, in frames", default=5, at_least=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -153,7 +153,7 @@ class Tracks(Section):
                                    "in place of box")
             return
         if len(self.volume) != 6 or not all(low < high for low, high in zip(self.volume[::2], self.volume[1::2])):
-            raise self.problem("volume", "must be six numbers x0, x1, y0, y1, z0, z1, of which each second is larger")
+            raise self.problem("volume", "must be six numbers x0, x1, y0, y1, z0, z1 with x0 < x1, y0 < y1, z0 < z1")
         if self.box is not None:
             raise self.problem("box", "a volume is given too, which is not periodic; remove one of the two")
 
@@ -177,7 +177,7 @@ class Time(Section):
 
     stepper: str = choice("time stepping method", "etdrk4", "rk4", default="etdrk4")
     courant: float = number("Courant number of the step (advective; rk4 also acoustic)", default=0.8, above=0)
-    max_step: float = number("largest step; smaller ones are this over a power of two", default=0.05, above=0)
+    max_step: float = number("largest step; smaller ones are this divided by a power of two", default=0.05, above=0)
     step: float | None = number("fixed time step; absent: courant and max_step give it", default=None, above=0)
     duration: float | None = number("run time after spin-up, without tracers only", default=None, above=0)
 
@@ -192,8 +192,8 @@ class SpinUp(Section):
     """The time before tracers are released, in which forced turbulence becomes stationary."""
 
     turnovers: float = number("length of the spin-up in large-eddy turnovers", above=0)
-    stationary: float | None = number("number of turnovers at its end, over which the stationary state is averaged",
-                                      default=None, above=0)
+    stationary: float | None = number("number of turnovers at the end of the spin-up over which the stationary state "
+                                      "is averaged", default=None, above=0)
 
 
 # The keys in which sets of tracers may differ.
@@ -202,37 +202,37 @@ OF_A_SET = ("particles_per_side", "count", "placement", "seed", "filtered", "fil
 
 @dataclass(frozen=True, kw_only=True)
 class Tracers(Section):
-    """Particles that follow the filtered flow: the ground truth of learning.
+    """Particles that follow the filtered flow: the ground truth for learning.
 
-    An absent `filter_width` gets its value when the section is made. `sets` has several sets that one simulation
-    carries, by NAME of [tracers.NAME]; each has the values of its own keys and else those of [tracers]. A scene that
-    chooses one by `set` has the values of that set, and no sets.
+    An absent `filter_width` gets its value when the section is made. `sets` holds the sets that one simulation carries,
+    by NAME of [tracers.NAME]; a set takes the keys that it lacks from [tracers]. If `set` chooses one of them, the
+    section takes its values, and `sets` is empty.
     """
 
     _holder: ClassVar[str] = "sets"
 
-    set: str | None = text("NAME of the set [tracers.NAME] to use; absent: with such sets only ground truths are made, "
-                           "one for each", default=None)
+    set: str | None = text("NAME of the set [tracers.NAME] to use; absent: if there are sets, only the ground truth of "
+                           "each is made", default=None)
     particles_per_side: int | None = integer("cube root of the number of particles", default=None, at_least=2,
                                              at_most=MOST_CELLS)
-    count: int | None = integer("number of particles, where particles_per_side is absent", default=None, at_least=8,
+    count: int | None = integer("number of particles, if particles_per_side is absent", default=None, at_least=8,
                                 at_most=MOST_CELLS**3)
-    placement: str = choice("initial positions of the particles; lattice: of particles_per_side", "random", "lattice",
-                            default="random")
+    placement: str = choice("initial positions of the particles; lattice: needs particles_per_side", "random",
+                            "lattice", default="random")
     seed: int = integer("number that is added to the seed of the scene for the initial positions", default=0,
                         at_least=0, at_most=10**18)
-    filtered: bool = boolean("whether the particles follow the filtered velocity; false: that of the whole flow",
+    filtered: bool = boolean("whether the particles follow the filtered velocity; false: the unfiltered one",
                              default=True)
-    filter_width: float = number("width of the Gaussian filter, whose tails meet beyond half the cube; absent: twice "
-                                 "the mean spacing, or half the cube where that is less",
+    filter_width: float = number("width of the Gaussian filter; absent: twice the mean spacing, or half the cube if "
+                                 "that is less",
                                  default=None, above=0, at_most=BOX_LENGTH / 2)
     interpolation: str = choice("splines from grid to particles", "cubic", "quintic", default="cubic")
     turnovers: float = number("time for which the particles are followed, in large-eddy turnovers", above=0)
-    forced: bool = boolean("whether [forcing] stays on meanwhile, so that the flow is stationary", default=False)
+    forced: bool = boolean("whether [forcing] stays on during this time, so that the flow is stationary", default=False)
     frame_interval: float = number("time between stored frames", above=0)
     field_cells: int | None = integer("cells along each side of the stored fields; absent: 1.5 x particles_per_side, "
-                                      "even", default=None, at_least=4)
-    field_every: int = integer("number of frames per stored field", default=5, at_least=1)
+                                      "rounded to even", default=None, at_least=4)
+    field_every: int = integer("interval between stored fields, in frames", default=5, at_least=1)
     sets: Mapping[str, Tracers] = sections()
 
     def __post_init__(self) -> None:
@@ -256,15 +256,15 @@ class Tracers(Section):
                 object.__setattr__(self, field.name, getattr(chosen, field.name))
 
     def _set_of(self, name: str, own: Any) -> Tracers:
-        """A set from its table, or from an object whose other keys are those of this section."""
+        """Make a set from its table or object; the keys outside OF_A_SET are those of this section."""
         if isinstance(own, Tracers):
             return dataclasses.replace(self, sets={}, set=None, **{key: getattr(own, key) for key in OF_A_SET})
         if not isinstance(own, dict):
             raise SceneError(f"tracers.{name}: must be a section; write [tracers.{name}] and its keys below")
         for key in own:
             if key not in OF_A_SET:
-                raise KeyProblem(f"tracers.{name}", key, ": no key of a set; the sets share all keys of [tracers] but "
-                                 f"{', '.join(OF_A_SET)}")
+                raise KeyProblem(f"tracers.{name}", key, ": not a key of a set; the sets share all keys of [tracers] "
+                                 f"except {', '.join(OF_A_SET)}")
         one = {"particles_per_side": None, "count": None} if {"particles_per_side", "count"} & {*own} else {}
         try:
             return dataclasses.replace(self, sets={}, set=None, **{**one, **own})
@@ -272,7 +272,7 @@ class Tracers(Section):
             raise problem.within(f"tracers.{name}") from None
 
     def with_count(self, count: int) -> Tracers:
-        """The same section with another number of particles."""
+        """The same section with another number of particles, at random places."""
         return dataclasses.replace(self, particles_per_side=None, count=count, placement="random")
 
     @property
@@ -296,7 +296,7 @@ class Tracers(Section):
         return self.particles_per_side or round(math.cbrt(self.particles), 9)
 
     def radius_of(self, neighbors: float) -> float:
-        """Radius h of the ball that holds so many of the N particles on average: n = N (4/3) pi h^3 / L^3."""
+        """Radius h of the ball that holds n = `neighbors` of the N particles on average: n = N (4/3) pi h^3 / L^3."""
         return BOX_LENGTH * (neighbors / self.particles / (4 / 3 * math.pi)) ** (1 / 3)
 
     @property
@@ -306,7 +306,7 @@ class Tracers(Section):
 
     @property
     def planes(self) -> int:
-        """Cells along each side of the grid of the resolved velocity, at whose planes the particles' slabs are cut.
+        """Cells along each side of the grid of the resolved velocity; the slabs of particles end at its planes.
 
         1.75 N^(1/3) rounded to even: the shortest resolved wave has 1.5 times the particles' Nyquist
         wavenumber and 2.3 cells, which cubic splines can follow.
@@ -314,12 +314,12 @@ class Tracers(Section):
         return 2 * round(0.875 * self._per_side)
 
 
-#: Values of absent keys of [kernel], and those of a preset in their place.
+#: Defaults of keys of [kernel], and the values that replace them in each preset.
 KERNEL_DEFAULTS = {"form": "kriging", "positive": True, "cutoff": "smooth", "normalization_weight": 0.0,
                    "learning_rate": 2e-3}
 KERNEL_PRESETS = {"paper": {"form": "average", "positive": False, "cutoff": "sigmoid", "normalization_weight": 1.0,
                             "learning_rate": 1e-3, "final_learning_rate": 1e-6}}
-# Default learning rate at the end of the training over that at the start.
+# Default ratio of the final learning rate to that at the start.
 FINAL_RATE = 0.05
 
 
@@ -330,24 +330,24 @@ class Kernel(Section):
     When the section is made, the preset fills the absent keys, and `preset` becomes None.
     """
 
-    preset: str | None = choice("a named set of values, below those that are given; paper: Eqs. 6 to 11 as published",
+    preset: str | None = choice("a named set of values for absent keys; paper: Eqs. 6 to 11 as published",
                                 *KERNEL_PRESETS, default=None)
-    form: str | None = choice("reconstruction of fields and gradients from particles: average: with weights W; linear, "
+    form: str | None = choice("reconstruction of fields and gradients from particles; average: with weights W; linear, "
                               "quadratic: polynomials fitted with W as weight; kriging: the best estimate for filtered "
                               "turbulence; absent: kriging", "average", "linear", "quadratic", "kriging", default=None)
-    positive: bool | None = boolean("whether W = alpha exp(NN) g, of unit integral; false: NN g of Eq. 7, which may be "
-                                    "negative, and the sums of Eq. 6 without a divisor; absent: true", default=None)
+    positive: bool | None = boolean("whether W = alpha exp(NN) g, of unit integral; false: W = NN g of Eq. 7, which "
+                                    "may be negative, and Eq. 6 is not normalised; absent: true", default=None)
     neighbors: float = number("mean number of particles within the support", default=NEIGHBORS, at_least=8)
     hidden: tuple[int, ...] = integers("widths of the network's tanh layers", default=(20, 20, 20, 20), at_least=1)
-    cutoff: str | None = choice("factor g that ends the kernel at its support, where the sigmoid is 1/2; absent: "
-                                "smooth", "smooth", "sigmoid", default=None)
+    cutoff: str | None = choice("factor g that ends the kernel at its support; sigmoid: 1/2 there; absent: smooth",
+                                "smooth", "sigmoid", default=None)
     gradient_weight: float = number("weight of the velocity gradient in the loss", default=1.0, at_least=0)
     normalization_weight: float | None = number("weight of (integral - 1)^2 of the kernel before it is normalised; "
                                                 "absent: 0", default=None, at_least=0)
     steps: int = integer("optimiser steps", at_least=1)
     points: int = integer("grid points drawn per step", default=2048, at_least=1)
     learning_rate: float | None = number("learning rate at the start; absent: 2e-3", default=None, above=0)
-    final_learning_rate: float | None = number("learning rate at the end; absent: a twentieth of the first",
+    final_learning_rate: float | None = number("learning rate at the end; absent: a twentieth of learning_rate",
                                                default=None, above=0)
 
     def __post_init__(self) -> None:
@@ -371,19 +371,19 @@ RECONSTRUCTED = {"velocity": 3, "gradient": 9, "vorticity": 3, "q": 1, "r": 1, "
 class Reconstruction(Section):
     """Fields from the particles of each frame, on a grid."""
 
-    method: str = choice("least-squares: solenoidal modes with a prior; memory: the same with the forecast from the "
-                         "frame before as the mean; kriging, quadratic, linear: from neighbours; average: with the "
-                         "kernel, Eqs. 5 and 6", "least-squares", "memory", "kriging", "quadratic", "linear", "average",
-                         default="least-squares")
+    method: str = choice("least-squares: solenoidal modes with a prior; memory: the same, and the forecast from the "
+                         "frame before is the mean of the prior; kriging, quadratic, linear: from neighbours; average: "
+                         "with the kernel, Eqs. 5 and 6", "least-squares", "memory", "kriging", "quadratic", "linear",
+                         "average", default="least-squares")
     cells: int | None = integer("cells along each side of the grid; absent: those of the stored fields", default=None,
                                 at_least=8, at_most=MOST_CELLS)
-    every: int = integer("number of frames per reconstruction", default=1, at_least=1)
+    every: int = integer("interval between reconstructions, in frames", default=1, at_least=1)
     fields: tuple[str, ...] = texts("quantities that are stored; gradient: du_i/dx_j, row by row; q, r: its invariants",
                                     *RECONSTRUCTED, default=("velocity", "vorticity", "pressure"))
     particles: bool = boolean("whether the quantities are stored at the particles too", default=False)
     holdout: float = number("share of the tracks that a second reconstruction leaves out, to estimate the error; 0: "
                             "none", default=0.1, at_least=0, at_most=0.5)
-    memory: float = number("time for which a wave is remembered, over 1 / (k u')", default=4.0, above=0)
+    memory: float = number("time for which a wave is remembered, in units of 1 / (k u')", default=4.0, above=0)
 
     @property
     def of_neighbors(self) -> bool:
@@ -398,11 +398,11 @@ class Horizons(Section):
     frames: tuple[int, ...] = integers("numbers of frames through which the simulation is differentiated, in turn",
                                        default=(1, 2, 4, 8), at_least=1)
     steps: int = integer("optimiser steps through each number of frames", at_least=1)
-    time_step: float | None = number("time step of the simulation; absent: the interval of frames", default=None,
+    time_step: float | None = number("time step of the simulation; absent: the frame interval", default=None,
                                      above=0)
     integrator: str = choice("time stepping method of the simulation", *SCHEMES, default="verlet")
-    learning_rate: float = number("learning rate at the start of each number of frames", default=1e-3, above=0)
-    energy_weight: float = number("weight of the energies by bands of wavenumbers in the loss", default=0.1, at_least=0)
+    learning_rate: float = number("learning rate at the start, for each number of frames", default=1e-3, above=0)
+    energy_weight: float = number("weight of the energies in wavenumber bands in the loss", default=0.1, at_least=0)
 
     @property
     def scheme(self) -> Scheme:
@@ -420,9 +420,9 @@ class Training(Section):
                            default=DEFAULT_WINDOW, above=0, at_most=1)
     frames: int = integer("number of frames to draw from, shared evenly by the ground truths", at_least=2)
     batch: int = integer("particles per step", at_least=1)
-    steps: int = integer("optimiser steps; 0: parameters stay as they start", at_least=0)
-    patience: int | None = integer("steps without a smaller validation error that end a phase, on trajectories or on "
-                                   "all losses; absent: all steps are taken", default=None, at_least=1)
+    steps: int = integer("optimiser steps; 0: parameters keep their initial values", at_least=0)
+    patience: int | None = integer("steps without a smaller validation error after which a phase ends, on trajectories "
+                                   "or on all losses; absent: all steps are taken", default=None, at_least=1)
     learning_rate: float = number("learning rate at the start", default=5e-3, above=0)
     final_learning_rate: float = number("learning rate at the end", default=1e-4, above=0)
     precision: str = choice("precision of the training", "float32", "float64", default="float32")
@@ -430,10 +430,10 @@ class Training(Section):
     field_target: str = choice("reference of the field loss; tracers: the kernel average of the true particles; flow: "
                                "the filtered field stored one frame later, on frames that have one", "tracers", "flow",
                                default="tracers")
-    velocity_kl_weight: float = number("weight of the divergence of velocity PDFs", default=0.0, at_least=0)
-    acceleration_kl_weight: float = number("weight of the divergence of acceleration PDFs", default=0.0, at_least=0)
-    power_weight: float = number("weight of the loss of the power, in all steps: the work of the force, in units of "
-                                 "u'^3 over the filter width", default=0.0, at_least=0)
+    velocity_kl_weight: float = number("weight of the KL divergence of velocity PDFs", default=0.0, at_least=0)
+    acceleration_kl_weight: float = number("weight of the KL divergence of acceleration PDFs", default=0.0, at_least=0)
+    power_weight: float = number("weight of the loss of the power of the force, in all steps; the power is in units "
+                                 "of u'^3 over the filter width", default=0.0, at_least=0)
     combined_steps: int = integer("number of steps at the end that use every loss", default=0, at_least=0)
     horizons: Horizons | None = section(Horizons, default=None)
 
@@ -459,7 +459,7 @@ class Method:
 
     needs: tuple[str, ...] = ()  # some of NEEDS
     title: str = "own method"  # name in tables and figures
-    on_grid: bool = False  # a flow on a coarse grid moves the particles, as [eulerian] says
+    on_grid: bool = False  # a flow on a coarse grid moves the particles, as given in [eulerian]
 
 
 METHODS = {
@@ -467,7 +467,7 @@ METHODS = {
     "none": Method(title="no force"),
     "eulerian": Method(title="coarse grid", on_grid=True),
 }
-# A trained model; the density of the ground truth; neighbours within the radius of interaction.
+# Needs of a method: a trained model, the density of the ground truth, neighbours within the radius of interaction.
 NEEDS = ("model", "density", "pairs")
 #: The value of [simulation] step that short rollouts replace by the step that they find.
 CONVERGED = "converged"
@@ -477,7 +477,7 @@ CONVERGED = "converged"
 class Simulation(Section):
     """The run of the particles, without the direct simulation."""
 
-    method: str = named("method that moves the particles; see Baselines", *METHODS, default="learned")
+    method: str = named("method that moves the particles; see docs/baselines.md", *METHODS, default="learned")
     integrator: str | None = choice("time stepping method of the particles; absent: rk3, or with step = \"converged\" "
                                     "the cheapest", *SCHEMES, default=None)
     step: float | str = number("longest time step; converged: the cheapest that has converged, found by short rollouts",
@@ -485,18 +485,19 @@ class Simulation(Section):
     step_from: str | None = text("run directory whose converged step is used; absent: it is found for this rollout",
                                  default=None)
     confirmed_on: tuple[str, ...] | None = texts(
-        "run directories or files of further ground truths, on each of which a step must have converged as well; "
+        "run directories or files of further ground truths, on each of which the step must have converged too; "
         "absent: the realisations of the scene", default=None)
     turnovers: float = number("length of the rollout in large-eddy turnovers", above=0)
     start: float | None = number("start of the rollout as a fraction of the ground truth; absent: the end of the "
                                  "training window, or the first field of a ground truth without training",
                                  default=None, at_least=0, below=1)
     frame_interval: float = number("time between stored frames", above=0)
-    skin: float = number("extra reach of the neighbour list, in supports", default=0.1, at_least=0, at_most=1)
+    skin: float = number("extra reach of the neighbour list, as a fraction of its radius", default=0.1, at_least=0,
+                         at_most=1)
     precision: str = choice("precision of the forces", "float32", "float64", default="float32")
     injection: float | str = number("large-scale forcing power per mass; truth: as in the ground truth while tracers "
-                                    "were followed; dissipation: as the flow loses", default="truth",
-                                    words=("truth", "none", "dissipation"), above=0)
+                                    "were followed; dissipation: the dissipation rate of the ground truth",
+                                    default="truth", words=("truth", "none", "dissipation"), above=0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -519,7 +520,7 @@ class Simulation(Section):
 
     @property
     def longest_step(self) -> float:
-        """The longest time step as given; infinite where short rollouts find it."""
+        """The longest time step as given; infinite if short rollouts find it."""
         return math.inf if isinstance(self.step, str) else self.step
 
     @property
@@ -555,7 +556,7 @@ class Simulation(Section):
 
     @property
     def title(self) -> str:
-        """The method in tables and figures."""
+        """Name of the method in tables and figures."""
         return self._properties.title
 
     @property
@@ -595,9 +596,9 @@ class Eulerian(Section):
                         default="incompressible")
     equations: str = choice("velocity of the equations; unfiltered: the whole velocity, whose filtered part moves the "
                             "particles; filtered: the filtered velocity", *EQUATIONS, default="unfiltered")
-    start: str = choice("modes at the start; flow: of the true flow; particles: those that least squares find in the "
+    start: str = choice("modes at the start; flow: those of the true flow; particles: a least-squares fit to the "
                         "velocities of the particles", "flow", "particles", default="flow")
-    closure: str = choice("model of the scales that the grid, or the filter, leaves out; see Baselines",
+    closure: str = choice("model of the scales that the grid, or the filter, leaves out; see docs/baselines.md",
                           *CLOSURES, default="none")
     smagorinsky: float = number("C_s of closure smagorinsky, the eddy viscosity (C_s Delta)^2 (2 S:S)^(1/2)",
                                 default=0.17, above=0)
@@ -620,11 +621,11 @@ class Eulerian(Section):
         return self.fluid == "compressible"
 
     def filter_passed(self, filter_width: float) -> float:
-        """Width of the filter that the velocity of the equations has passed: the particles' filter width, or 0."""
+        """Filter width of the velocity in the equations: that of the particles, or 0 for the unfiltered velocity."""
         return filter_width if self.equations == "filtered" else 0.0
 
     def cells_for(self, filter_width: float) -> int:
-        """Cells along each side: as given, or the fewest whose Nyquist wavenumber reaches pi / d."""
+        """Cells along each side: as given, or the fewest whose Nyquist wavenumber reaches pi / filter width."""
         if self.cells is not None:
             return self.cells
         return max(math.ceil(BOX_LENGTH / filter_width - 1e-9), 8)

@@ -1,4 +1,4 @@
-"""The settings of each term and its properties, without torch; and the presets, lists of terms with a name.
+"""The settings and properties of each term, and the presets, which are named lists of terms. Does not need torch.
 
 A class of settings is a section of a scene: a frozen dataclass whose fields declare the keys of [model.NAME].
 """
@@ -16,12 +16,13 @@ from eddies.scene.values import Section, boolean, choice, integer, integers, nam
 
 READS = ("pairs", "resolved", "density")
 GIVES = ("acceleration", "density", "density_rate", "shift_velocity")
-#: The inputs of a network of pairs, in units of the flow: the densities of both, |x|, |v| and x.v.
+#: The inputs of a pair network, in units of the flow: the densities of both particles, |x|, |v| and x.v.
 INPUTS = ("density", "distance", "speed", "approach")
 BASES = ("corrected", "paper", "unit")
-# The largest rate of relaxation over its nominal rate. The estimate from neighbours has the noise of a particle with
-# the wrong sign: 3.6 to 4.0 among random particles and in turbulence. Two fifths are a margin for other noise: with
-# 4.2 a flow at M_t = 0.16 diverged after a turnover, with 5.5 one of 256^3 cells after a few steps.
+# The ratio of the largest rate of relaxation to the nominal rate. The estimate from neighbours has the noise of a
+# particle with the wrong sign, so the ratio is 3.6 to 4.0 among random particles and in turbulence. Two fifths are
+# added for other noise: with 4.2 a flow at M_t = 0.16 diverged after a turnover, with 5.5 one of 256^3 cells after a
+# few steps.
 NOISE_AMONG_NEIGHBORS = 5.6
 
 
@@ -38,11 +39,11 @@ class StepUnits:
 
 
 class TermError(UserError, ValueError):
-    """A term cannot be made with its settings, or contradicts its declaration; the text gives term and remedy."""
+    """A term cannot be made with its settings, or contradicts its declaration; the text names the term and a remedy."""
 
 
 class TermBase:
-    """Base of eddies.Term, by which a class of a term is recognised without torch."""
+    """Base of eddies.Term, by which the class of a term is recognised without importing torch."""
 
     Settings: type["TermSettings"]
 
@@ -53,14 +54,14 @@ class TermSettings(Section):
 
     Attributes
     ----------
-    word : its name in scenes; empty of a user's class.
+    word : its name in scenes; empty for a user's class.
     reads : any of "pairs" (neighbours within the interaction radius, also for kriging), "resolved" (the velocity on a
-        grid) and "density" (computed, stored, and needed in the ground truth). Nothing else is built for it.
+        grid) and "density" (computed, stored, and needed in the ground truth). Only these are computed for it.
     gives : any of "acceleration", "density" (a part of it), "density_rate" and "shift_velocity".
     learns_through_horizons : only training through several steps of the simulation fits its parameters.
     viscous : it needs the viscosity of the fluid.
-    damps_by : its parameter with rates of damping by wavenumber, which a coarse grid can take; empty: it has none.
-    too_long : error for a step beyond `longest_step`, with the term's {name}, the {longest} step and the {integrator}.
+    damps_by : its parameter with damping rates by wavenumber, which a coarse grid can use; empty: it has none.
+    too_long : text of the error for a step beyond `longest_step`; it may contain {name}, {longest} and {integrator}.
     """
 
     word: ClassVar[str] = ""
@@ -72,7 +73,7 @@ class TermSettings(Section):
     too_long: ClassVar[str] = ""
 
     def longest_step(self, units: StepUnits) -> float:
-        """The longest step of a rollout that the term allows; infinite without a limit, or where it is unknown."""
+        """The longest step of a rollout that the term allows; infinite if there is no limit, or if it is unknown."""
         return math.inf
 
     @classmethod
@@ -83,12 +84,12 @@ class TermSettings(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class PairSum(TermSettings):
-    """The weight of the values of pairs, and the scale of their sum."""
+    """A sum over pairs, with the weight of each pair and the scaling of the sum."""
 
-    window: str = choice("factor of a pair at the distance q, over the radius of interaction; smooth: (1 - q^2)^2; "
-                         "none: 1, and a rate jumps where a neighbour enters or leaves", "smooth", "none",
+    window: str = choice("factor of a pair at the distance q, in radii of interaction; smooth: (1 - q^2)^2; none: 1, "
+                         "so that rates jump when a neighbour enters or leaves", "smooth", "none",
                          default="smooth")
-    scaling: str = choice("factor of the sum, by the expected number n of neighbours; number: 1/n; root: n^(-1/2)",
+    scaling: str = choice("factor of the sum, from the expected number n of neighbours; number: 1/n; root: n^(-1/2)",
                           "number", "root", default="number")
 
 
@@ -97,7 +98,7 @@ class ForceSum(PairSum):
     """A sum of forces between pairs along two directions."""
 
     basis: str = choice("directions of a pair's forces; paper: x and v of Eq. 4; unit: x/|x| and v/|v|; corrected: x "
-                        "and v, and the sum times the inverse moment matrix in place of its scaling", *BASES,
+                        "and v, with the inverse moment matrix as the scaling of the sum", *BASES,
                         default="corrected")
 
     def __post_init__(self) -> None:
@@ -128,14 +129,14 @@ class PairNetwork(ForceSum, NetworkSettings):
 
     word = "pairs"
 
-    symmetry: str = choice("symmetry of a pair; antisymmetric: opposite forces, which keep the momentum; not with "
+    symmetry: str = choice("symmetry of a pair; antisymmetric: opposite forces, which conserve momentum; not with "
                            "basis corrected", "none", "antisymmetric", default="none")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.symmetry == "antisymmetric" and self.basis == "corrected":
-            raise self.problem("symmetry", 'with basis = "corrected" the forces of a pair are not opposite, as each '
-                               'particle has a moment matrix of its own; set basis = "paper", or symmetry = "none"')
+            raise self.problem("symmetry", 'with basis = "corrected" the forces of a pair are not opposite, because '
+                               'each particle has its own moment matrix; set basis = "paper", or symmetry = "none"')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -226,7 +227,7 @@ class Relaxation(TermSettings):
 class Forcing(TermSettings):
     """Linear forcing of the large scales at a prescribed power."""
 
-    injection_rate: float = number("power injected per unit mass of the flow, before the filter", at_least=0)
+    injection_rate: float = number("power injected per unit mass of the unfiltered flow", at_least=0)
     wavenumber: float = number("limit of the forced modes, 0 < |k| < wavenumber", default=2.0, above=1)
 
     reads = ("resolved",)
@@ -238,7 +239,7 @@ class Continuity(TermSettings):
 
     word = "continuity"
 
-    diffusion: float = number("delta of the density's diffusion (Molteni & Colagrossi 2009), at first; 0: without",
+    diffusion: float = number("initial delta of the density diffusion (Molteni & Colagrossi 2009); 0: no diffusion",
                               default=0.0, at_least=0)
 
     reads = ("pairs", "density")
@@ -256,18 +257,18 @@ class WCSPH(TermSettings):
 
     word = "wcsph"
 
-    speed: float = number("sound speed of the pressure over that of the flow, at first", default=1.0, above=0)
+    speed: float = number("initial sound speed of the pressure, in units of that of the flow", default=1.0, above=0)
     alpha: float = number("linear coefficient of the artificial viscosity", default=1.0, at_least=0)
     beta: float = number("quadratic coefficient of the artificial viscosity", default=2.0, at_least=0)
     exponent: float = number("gamma of the pressure c^2 rho_0 / gamma ((rho / rho_0)^gamma - 1)", default=1.0,
                              at_least=1)
 
     reads = ("pairs", "density")
-    too_long = ('the term "{name}" has to resolve sound, with a step of at most {longest} unless it learns a slower '
-                'one; lower step, and use integrator = "verlet"')
+    too_long = ('the term "{name}" has to resolve sound, with a step of at most {longest} unless it learns a lower '
+                'sound speed; lower step, and use integrator = "verlet"')
 
     def longest_step(self, units: StepUnits) -> float:
-        """0.4 h / (c (1 + 0.6 alpha)) (Monaghan 1992), h half the kernel's support, c that of the pressure."""
+        """0.4 h / (c (1 + 0.6 alpha)) (Monaghan 1992), h half the kernel's support, c the pressure's speed of sound."""
         if units.sound_speed is None:
             return math.inf
         return 0.4 * units.radius / 2 / (self.speed * units.sound_speed * (1 + 0.6 * self.alpha))
@@ -291,18 +292,20 @@ class FilteredEquations(TermSettings):
 
     sweeps: int = integer("iterations of the pressure among neighbours in each evaluation", default=8, at_least=1,
                           at_most=32)
-    relaxation: float = number("rate, over 2 u'/d, at which a velocity relaxes to the estimate from its neighbours",
-                               default=1.0, at_least=0)
-    solenoidal: float = number("rate, over 2 u'/d, at which the pressure removes a divergence", default=3.5, at_least=0)
-    density: float = number("rate, over 2 u'/d, at which the density follows the pressure", default=3.5, at_least=0)
+    relaxation: float = number("rate, in units of 2 u'/d, at which a velocity relaxes to the estimate from its "
+                               "neighbours", default=1.0, at_least=0)
+    solenoidal: float = number("rate, in units of 2 u'/d, at which the pressure removes a divergence", default=3.5,
+                               at_least=0)
+    density: float = number("rate, in units of 2 u'/d, at which the density follows the pressure", default=3.5,
+                            at_least=0)
 
     reads = ("pairs", "density")
     gives = ("acceleration", "density_rate")
-    too_long = ('noise among the particles of "{name}" relaxes so fast that it grows with integrator = "{integrator}" '
+    too_long = ('"{name}" relaxes the noise of the particles so fast that it grows with integrator = "{integrator}" '
                 "in steps of more than about {longest}; lower step to that")
 
     def longest_step(self, units: StepUnits) -> float:
-        """The step in which the noise of single particles relaxes as much as the scheme can follow."""
+        """The longest step in which the scheme can follow the relaxation of the noise of single particles."""
         if not units.velocity or not self.relaxation:
             return math.inf
         rate = NOISE_AMONG_NEIGHBORS * self.relaxation * 2 * units.velocity / units.filter_width
@@ -313,14 +316,14 @@ class FilteredEquations(TermSettings):
 TERMS: dict[str, type[TermSettings]] = {kind.word: kind for kind in list(globals().values())
                                         if isinstance(kind, type) and issubclass(kind, TermSettings) and kind.word}
 
-# Near the result of training; with the method's own values friction is tens of times the accelerations of turbulence.
+# Near the result of training. With the usual values friction is tens of times the accelerations of turbulence.
 LITTLE_FRICTION = {"alpha": 0.05, "beta": 1.5}
 
 RESOLVED = ("pressure", "stress", "viscosity", "damping", "relaxation")
 
 
 def _published(basis: str, hidden: tuple[int, ...]) -> dict[str, Mapping[str, Any]]:
-    """Eq. 3: networks of force and density, and Pi of both; open choices of the text are those of the public code."""
+    """Eq. 3: networks of force and density, and Pi in both. What the paper leaves open is as in its public code."""
     plain, network = {"window": "none", "scaling": "root"}, {"hidden": hidden}
     return {"pairs": {"basis": basis, **plain, **network},
             "eddy-viscosity": {"basis": basis, "form": "bounded", **plain},

@@ -1,8 +1,8 @@
 """Sections of a scene: frozen dataclasses whose fields declare their keys.
 
-A field declares its key by one of the functions `number`, `integer`, `integers`, `boolean`, `choice`, `named`, `text`
-and `texts`: the meaning, the allowed values and the default. Errors, written scenes, the reference page and the JSON
-schema use this one declaration. It holds for objects made in a program as for those read from a TOML file.
+A field declares its key by a function (`number`, `numbers`, `integer`, `integers`, `boolean`, `choice`, `named`, `text`
+or `texts`): the meaning, the allowed values and the default. Errors, written scenes, the reference page and the JSON
+schema use this one declaration. It applies to objects made in a program and to those read from a TOML file.
 """
 
 import dataclasses
@@ -45,9 +45,9 @@ class KeyProblem(SceneError):
 
 
 class Section:
-    """Base of the dataclasses of a scene: making one checks every value and holds it in the form of its rule.
+    """Base of the dataclasses of a scene. The constructor checks every value and stores it in the form of its rule.
 
-    Raises KeyProblem for a value that its declaration refuses.
+    Raises KeyProblem for a value that its declaration does not allow.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Section:
         return re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
 
     def problem(self, key: str, problem: str) -> KeyProblem:
-        """Return an error about a key, which begins with the key and its value."""
+        """Return an error about a key; its text begins with the key and its value."""
         return KeyProblem(self.section_name(), key, f" = {shortened(quoted(getattr(self, key)))}: {problem}")
 
     def _accepted(self, field: dataclasses.Field, value: Any) -> Any:
@@ -127,7 +127,7 @@ def text(about: str, default: Any = MISSING) -> Any:
 
 
 def texts(about: str, *words: str, default: Any = MISSING, paths: bool = False) -> Any:
-    """Declare a dataclass field that holds a tuple of strings: of `words` if any are given, or import paths."""
+    """Declare a dataclass field that holds a tuple of strings: any, or only `words`, and import paths if `paths`."""
     return _declare(Rule(str, about, words=words, paths=paths, many=True), default)
 
 
@@ -153,21 +153,21 @@ def rule_of(kind: type, field: dataclasses.Field) -> Rule | None:
     annotation = field.type if isinstance(field.type, str) else inspect.formatannotation(field.type)
     rule = ANNOTATIONS.get(annotation.removesuffix(" | None"))
     if rule is None:
-        raise SceneError(f"{kind.__qualname__}.{field.name}: {annotation}: a key is declared by number, integer, "
-                         f"boolean, text, ... of eddies, or its annotation is one of {', '.join(ANNOTATIONS)}")
+        raise SceneError(f"{kind.__qualname__}.{field.name}: {annotation}: declare the key by number, integer, "
+                         f"boolean, text, ... of eddies, or annotate it with one of {', '.join(ANNOTATIONS)}")
     return rule
 
 
 #: The rules of fields with an annotation but no declaration.
 ANNOTATIONS = {"float": Rule(float), "int": Rule(int), "bool": Rule(bool), "str": Rule(str),
-               "tuple[int, ...]": Rule(int, many=True)}
+               "tuple[int, ...]": Rule(int, many=True), "tuple[float, ...]": Rule(float, many=True)}
 
 
 def read_section(kind: type[Section], table: Any, name: str = "", others: Sequence[str] = ()) -> Any:
     """Make a section of the class `kind` from a TOML table.
 
     `name` is the name of the section, empty for the whole document. An error about an unknown key lists the keys of the
-    class and `others`. Raises SceneError for an unknown key, a missing key, or a value that its declaration refuses.
+    class and `others`. Raises SceneError for an unknown key, a missing key, or a value that is not allowed.
     """
     if not isinstance(table, dict):
         message = f"{name} = {shortened(quoted(table))}: must be a section; write [{name}] and its keys below"
@@ -209,7 +209,7 @@ def write_section(section: Section, name: str = "", all_keys: bool = False) -> l
     """Return the lines `key = value  # meaning` of a section and of its own sections.
 
     Absent keys and sections, and sections without keys, are left out. With `all_keys` comments list them. A section
-    within one of its own class does not repeat its lines.
+    inside another section does not repeat the lines of that section.
     """
     lines, inner = [], []
     for field in dataclasses.fields(section):
@@ -227,7 +227,7 @@ def write_section(section: Section, name: str = "", all_keys: bool = False) -> l
             for key, part in value.items():
                 written = [line for line in write_section(part, all_keys=all_keys) if line not in lines]
                 same = isinstance(part, type(section))
-                if same:  # a key of the outer section holds where the inner one lacks it
+                if same:  # an inner section without a key takes it from the outer one
                     written += [f'{each.name} = "{ABSENT}"' for each in dataclasses.fields(part)
                                 if getattr(part, each.name) is None and getattr(section, each.name) is not None]
                 if written or same:
@@ -248,7 +248,7 @@ def _line(key: str, rule: Rule, value: Any) -> str:
 
 
 def import_paths(part: Section) -> Iterator[tuple[str, str]]:
-    """Yield each key of a section that may hold import paths, with each import path that it holds."""
+    """Yield (key, import path) for each import path in a section."""
     for field in dataclasses.fields(part):
         rule, value = rule_of(type(part), field), getattr(part, field.name)
         if rule is not None and rule.paths:
@@ -265,8 +265,8 @@ def expanded(path: str) -> Path:
 
 
 def product_file(path: str, stage: str) -> Path:
-    """Return the file of a stage's product that a key names: the path itself if it ends in .h5, else in this run
-    directory."""
+    """Return the file of a stage's product: `path` itself if it ends in .h5, else the product in the run directory
+    `path`."""
     file = expanded(path)
     return file if path.endswith(".h5") else file / STAGES[stage].file
 

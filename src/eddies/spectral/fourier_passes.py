@@ -17,7 +17,7 @@ from eddies.cores import threads
 from eddies.kernels.copies import ColumnCopies, PlaneCopies
 from eddies.kernels.library import library
 
-BLOCK_BYTES = 2**18  # per component and thread in a pass: a few of them fit the second-level cache of a core
+BLOCK_BYTES = 2**18  # size of a block per component and thread: a few blocks fit the second-level cache of a core
 CACHE_LINE = 64
 # Numbers that are a multiple of this many bytes apart share few sets of a cache and evict each other. A transform of 48
 # such numbers takes twelve times as long, one of 192 four times.
@@ -91,7 +91,7 @@ class PlanePass:
         self._plans: dict[tuple[str, int, int], PlanePlans] = {}
 
     def blocks(self, count: int) -> list[slice]:
-        """Divide `count` planes into the blocks that are transformed together: even numbers, and an odd one alone."""
+        """Divide `count` planes into the blocks transformed together: even ones, and an odd last plane alone."""
         size, even = 2 * max(1, threads() * BLOCK_BYTES // (self.cells**2 * self.dtype.itemsize)), count - count % 2
         blocks = [slice(start, min(start + size, even)) for start in range(0, even, size)]
         return blocks if even == count else [*blocks, slice(even, count)]
@@ -107,8 +107,8 @@ class PlanePass:
         return plans
 
     def to_modes(self, plans: PlanePlans, blocks: Any, component: int, planes: slice) -> None:
-        """Transform planes of fields to twice their modes, not normalised, and store them in blocks described by the
-        copies, as components from `component` on."""
+        """Transform planes of fields to twice their modes, not normalised, and store them as components `component`,
+        `component` + 1, ... of `blocks`, which are in the form that the copies take."""
         for number, of_field in enumerate(plans.plans, component):
             for plan in of_field:
                 plan.execute()
@@ -160,7 +160,7 @@ class PlanePass:
 
 
 def _gap(count: int, dtype: np.dtype) -> int:
-    """Return the padding after a line of `count` numbers that transforms cross, so that they do not crowd a cache."""
+    """Return the padding after each line of `count` numbers with which transforms across lines do not crowd a cache."""
     return 0 if count * dtype.itemsize % CROWDED else CACHE_LINE // dtype.itemsize
 
 

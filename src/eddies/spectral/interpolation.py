@@ -52,8 +52,8 @@ class SplineInterpolation:
     def around(self, positions: np.ndarray) -> Splines:
         """Return the splines around positions (n, 3), for several uses at the same points.
 
-        x and y may be anywhere, z must be in the slab or the margin, periodically. Raises HaloError where it is not,
-        and ValueError where a position is not finite.
+        x and y may be anywhere. z, up to whole periods, must be in the slab or the margin. Raises HaloError if it is
+        not, and ValueError if a position is not finite.
         """
         try:
             return Splines(library(), self.degree, positions, self._padded)

@@ -53,7 +53,7 @@ class SpectralGrid(ModeOperators):
         self.cutoff = (self.cells - 1) // 3 if cutoff is None else int(cutoff)
         self.precision, self.real, self.complex = precision, REAL[precision], COMPLEX[precision]
         self.modes = 2 * self.cutoff + 1
-        #: first ky of each rank in storage order, and the number of all: (ranks + 1,)
+        #: first row of ky of each rank in storage order and, at the end, the number of rows: (ranks + 1,)
         self.column_starts = block_starts(self.modes, decomposition.size)
         self._batches: dict[tuple[str, int], _Batch] = {}
         self.column_pass = ColumnPass(self.cells, self.cutoff, self.complex)
@@ -145,7 +145,7 @@ class SpectralGrid(ModeOperators):
         expand : makes the modes of the fields, in parts (c_i, pairs, ky, kx), from packed modes in (ky, kx) of pairs of
             planes. It gets those of `spectral` and of the z derivatives of its first `z_derivatives` components. It
             may combine them and multiply by `d_dx` and `d_dy`. A part (d_dx, modes) is multiplied while it is copied.
-            By default the fields are what `expand` would get.
+            By default the fields are the input of `expand`.
         """
         for planes, values in self._value_blocks(spectral, fields, expand, z_derivatives):
             yield values[..., ::2] if planes.stop - planes.start == 1 else values
@@ -164,7 +164,7 @@ class SpectralGrid(ModeOperators):
             yield planes, copies.pack(blocks, planes)
 
     def _columns_to_planes(self, spectral: np.ndarray, z_derivatives: int) -> _Batch:
-        """Transform components and the z derivatives of the first of them along z, and redistribute them to planes."""
+        """Transform components, and z derivatives of the first `z_derivatives`, along z; redistribute all to planes."""
         components, copies = len(spectral), self.column_pass.copies
         batch = self._batch("backward", components + z_derivatives)
         modes = self._described(spectral, self.complex, self.spectral_shape)
@@ -181,13 +181,13 @@ class SpectralGrid(ModeOperators):
         return batch
 
     def _described(self, array: np.ndarray, dtype: type, shape: tuple[int, ...]) -> Any:
-        """An array of the caller in the form that the copies take. Raises ValueError for another shape."""
+        """Return an array of the caller in the form that the copies take. Raises ValueError for another shape."""
         array = np.require(array, dtype, "CW")
         require(array, (len(array), *shape), dtype)
         return self.plane_pass.copies.described(array)
 
     def _planes_to_columns(self, components: int) -> np.ndarray:
-        """Redistribute the components of the "forward" batch to columns, and transform them along z: their modes."""
+        """Return the modes of the "forward" batch: redistribute its components to columns, transform them along z."""
         batch, copies = self._batch("forward", components), self.column_pass.copies
         batch.transpose.to_columns()
         spectral = np.empty((components, *self.spectral_shape), self.complex)
@@ -201,7 +201,7 @@ class SpectralGrid(ModeOperators):
         return spectral
 
     def _batch(self, direction: str, components: int) -> _Batch:
-        """Return the memory in which a batch of components is sent. One transform at a time uses a direction."""
+        """Return the memory in which a batch of components is sent, for one transform at a time in each direction."""
         key = (direction, components)
         if key not in self._batches:
             transpose = Transpose(self.decomposition.comm, self.cells, self.modes, components, self.cutoff + 1,
@@ -221,7 +221,7 @@ class SpectralGrid(ModeOperators):
 
 
 def regrid(source: SpectralGrid, target: SpectralGrid, spectral: np.ndarray) -> np.ndarray:
-    """Return a field (c, kz, ky, kx) given on `source` with the modes of `target`, finer or coarser; new ones are 0."""
+    """Return the modes on `target`, finer or coarser, of a field (c, kz, ky, kx) on `source`; new modes are 0."""
     K = min(source.cutoff, target.cutoff)
     planes = [np.r_[0 : K + 1, grid.modes - K : grid.modes] for grid in (source, target)]
     sent, received = (np.abs(grid.index[1].ravel()) <= K for grid in (source, target))

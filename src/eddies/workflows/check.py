@@ -51,7 +51,7 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
     rollout_of = {name: estimate(each).rollout for name, each in (scene.variant or {scene.name: scene}).items()}
     context = here(scene.stages_of_all, scene.directory, comm)
     (refusals, warnings), limits, turbulence = problems(scene, context), most_ranks(scene), expected.turbulence
-    # The scenes of each stage by variant (None: shared by all) and stage; several with realisations.
+    # Scenes by variant (None: shared by all variants) and stage. With realisations a stage has several scenes.
     work: dict[tuple[str | None, str], list[Scene]] = {}
     planned = steps(scene, scene.stages_of_all, scene.directory)
     for step in sorted(planned, key=lambda step: [None, *scene.variant].index(step.variant)):
@@ -81,7 +81,7 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
 
 
 def cost(variant: str | None, stage: str, scenes: Sequence[Scene], ranks: int) -> dict[str, Any]:
-    """Time, memory and disk of a stage of some scenes, on the given ranks and on the most that it can use."""
+    """Cost of a stage for some scenes: wall time, memory and disk, on `ranks` ranks and on the most it can use."""
     most = min(min(most_ranks(each.ground_truth_alone if stage == "dns" else each).values()) for each in scenes)
 
     def total(values: Sequence[float | None]) -> float | None:
@@ -105,9 +105,9 @@ def lines(found: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
             yield from ((key, f"{name}: {as_text(rollout)}") for name, rollout in value.items())
         elif key not in ("scene", "stage_costs", "totals", "warnings", "refusals"):
             yield key, as_text(value)
-    rows = {name_of(row): row for row in found["stage_costs"]} | {"in all": found["totals"]}
+    rows = {name_of(row): row for row in found["stage_costs"]} | {"total": found["totals"]}
     width = max(map(len, rows))
-    yield "costs", "wall time within a factor of three; on these ranks, and on the most that a stage can use"
+    yield "costs", "wall time within a factor of three: on these ranks, then on the largest number that a stage can use"
     yield "costs", f"{'stage':{width}}  {'wall time':>12}  memory a rank      disk"
     for name, row in rows.items():
         line = f"{name:{width}}  {wall_time(row['seconds']):>12}  {in_units(row['memory']):>13}  "
@@ -122,7 +122,7 @@ def lines(found: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def as_text(value: Any) -> str:
-    """An estimate as text."""
+    """Return an estimate as text."""
     if isinstance(value, dict):
         return ", ".join(f"{name} {as_text(part)}" for name, part in value.items())
     if isinstance(value, list):
@@ -131,7 +131,7 @@ def as_text(value: Any) -> str:
 
 
 def name_of(row: Mapping[str, Any]) -> str:
-    """Name of a row of the stages."""
+    """Return the name of a row of the table of stages."""
     name = f"{row['variant']}: {row['stage']}" if row["variant"] else row["stage"]
     return f"{name} ({row['runs']} times)" if row["runs"] > 1 else name
 

@@ -1,10 +1,9 @@
-"""Compare two runs for a person: their settings, and the numbers of their reports."""
+"""`eddies diff`: print the settings, and the numbers of the reports, in which two runs differ."""
 
 from __future__ import annotations
 
 import sys
 import tomllib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,8 @@ from eddies.io.hdf5 import in_files
 from eddies.io.provenance import read_metrics
 from eddies.parallel.communicator import Comm
 from eddies.report.page import shown
+from eddies.scene.layers import dotted
 from eddies.scene.scene import load_scene
-from eddies.workflows.run_directory.work import leaves
 
 METRICS = Path("report") / "metrics.json"
 
@@ -28,18 +27,13 @@ def run(one: Path, other: Path, comm: Comm) -> None:
 def diff_lines(one: Path, other: Path) -> list[str]:
     """A table of the settings, defaults included, then one of the numbers with the ratio of the second to the first."""
     runs = one, other
-    settings = [flattened(tomllib.loads(load_scene(path / "scene.toml").to_toml())) for path in runs]
+    settings = [dict(dotted(tomllib.loads(load_scene(path / "scene.toml").to_toml()))) for path in runs]
     lines = [*table("setting", settings, runs), ""]
     if missing := [path for path in runs if not (path / METRICS).is_file()]:
-        return [*lines, f"no numbers to compare: {', '.join(f'`eddies report {path}`' for path in missing)} makes them"]
-    metrics = [flattened(read_metrics(path / METRICS)) for path in runs]
+        return [*lines, f"no numbers to compare; run {' and '.join(f'`eddies report {path}`' for path in missing)}"]
+    metrics = [dict(dotted(read_metrics(path / METRICS))) for path in runs]
     numbers = [{key: value for key, value in each.items() if isinstance(value, int | float)} for each in metrics]
     return [*lines, *table("number", numbers, runs, ratio=True)]
-
-
-def flattened(nested: Mapping[str, Any]) -> dict[str, Any]:
-    """All values by their path, "section.key"."""
-    return {".".join(keys): value for keys, value in leaves(nested)}
 
 
 def table(title: str, columns: list[dict[str, Any]], runs: tuple[Path, Path], ratio: bool = False) -> list[str]:

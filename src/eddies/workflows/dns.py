@@ -37,19 +37,19 @@ from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, stage_fin
 
 log = logging.getLogger("eddies")
 
-# Raises SceneError if a time takes too many steps of at most a given length.
+# Called with a time and a largest step; raises SceneError if the time takes too many such steps.
 SpanCheck = Callable[[float, float], None]
 
 
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Simulate the flow of a scene and write ground_truth.h5: statistics, and frames and fields with [tracers].
 
-    With sets of tracers each set has a ground truth of its own, SET/ground_truth.h5, as if it were the only one. That
-    of the run directory is then one without tracers.
+    With sets of tracers, each set gets its own ground truth SET/ground_truth.h5, as if it were the only set. The ground
+    truth of the run directory then has no tracers.
 
-    The flow is first spun up ([spin_up]). The forcing ends at the release of the tracers, unless [tracers] forced. The
-    run continues from the newest checkpoint in the directory that has the same settings, except for how long it goes
-    on. The last state is kept as such a checkpoint; the frames before it are then those of the product.
+    The flow is first spun up ([spin_up]). The forcing ends at the release of the tracers, unless [tracers] forced is
+    true. The run continues from the newest checkpoint with the same settings; only its duration may differ. Without
+    sets, the last state is kept as a checkpoint. The frames before it are then those of the product.
 
     Raises SceneError if the checkpoint is later than the end of the run, and Stopped, after a checkpoint, if `stop`
     requests it.
@@ -63,7 +63,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     if saved is not None and saved["phase"] == "tracers" and not saved.files and not (
             same_course and holds_frames(comm, product, saved["frames"])):
         if comm.rank == 0:
-            log.warning("%s: lacks the frames before the checkpoint, which is not used", product)
+            log.warning("%s: lacks the frames before the checkpoint, so the checkpoint is not used", product)
         guard.checkpoints.remove()
         saved = None
     state = initial_state(scene.initial, scene.seed, fluid) if saved is None else None
@@ -75,7 +75,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         log.info("dns: continues from step %d, time %.4g", flow.clock.steps, flow.clock.time)
     provenance = {**stage_provenance(scene, "dns"), "course": course, "duration": scene.duration}
     if same_course and saved is not None and scene.tracers is not None:
-        provenance["id"] = origin["id"]  # its frames stay, and so does what was made from them
+        provenance["id"] = origin["id"]  # its frames stay, so products made from them stay valid
     sets = scene.tracer_sets
     with holding(comm, [directory / name for name in sets]), create_product(
             comm, product, "ground_truth", provenance) as file:
@@ -101,7 +101,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 for name, own in sets.items():
                     path = directory / name / product.name
                     if in_files(comm, path, partial(product_fingerprint, path)) == stage_fingerprint(own, "dns"):
-                        continue  # what was made from it stays valid
+                        continue  # products made from it stay valid
                     in_files(comm, path, partial(prepare_set, path.parent, own.to_toml()))
                     with create_product(comm, path, "ground_truth", stage_provenance(own, "dns")) as part:
                         write_tracers(part, tracers, name, parts, own.forcing)
@@ -127,7 +127,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
 
 @contextmanager
 def holding(comm: Comm, directories: Sequence[Path]) -> Iterator[None]:
-    """Hold the run directories of sets of tracers, which are made if they are missing; collective."""
+    """Lock the run directories of the sets of tracers, and make those that are missing; collective."""
     with ExitStack() as locks:
         for directory in directories:
             locks.enter_context(lock_directory(comm, directory))
@@ -135,7 +135,7 @@ def holding(comm: Comm, directories: Sequence[Path]) -> Iterator[None]:
 
 
 def prepare_set(directory: Path, text: str) -> None:
-    """Write the text of the scene of a set of tracers, unless another scene works in its directory."""
+    """Write the scene of a set of tracers to scene.toml in its directory, unless there is such a file."""
     if not (directory / "scene.toml").exists():
         write_files({directory / "scene.toml": text})
 
@@ -160,16 +160,16 @@ def write_flow(file: File, flow: FlowRun, scales: Mapping[str, float], spin_up: 
 
 
 def holds_frames(comm: Comm, product: Path, count: int) -> bool:
-    """Whether a ground truth has so many frames; collective."""
+    """Whether a ground truth exists and has exactly `count` frames; collective."""
     with suppress(ProductError), open_product(comm, product, "ground_truth") as file:
         return len(Trajectory(file, "tracers").times) == count
     return False
 
 
 def too_late(guard: Guard, key: str) -> SceneError:
-    """The error of a checkpoint that is later than the end of the run."""
-    return SceneError(f"{key}: the checkpoint in {guard.checkpoints.path} is later; raise the key, or remove that "
-                      "directory to simulate from the beginning")
+    """Return the error for a checkpoint that is later than the end of the run."""
+    return SceneError(f"{key}: the checkpoint in {guard.checkpoints.path} is later than this end of the run; raise the "
+                      "key, or remove that directory to simulate from the beginning")
 
 
 def run_for(flow: FlowRun, duration: float, check: SpanCheck) -> None:
@@ -215,7 +215,7 @@ def stationary_span(settings: SpinUp, history: FlowHistory) -> dict[str, float]:
 
 
 def write_final_fields(file: File, flow: FlowRun) -> None:
-    """Store the last velocity, and density of a compressible fluid, on the full grid."""
+    """Store the final velocity, and for a compressible fluid the density, on the full grid."""
     grid = flow.fluid.grid
     physical = grid.backward(flow.state)
     variables = {"velocity": physical[:3]}

@@ -1,4 +1,4 @@
-"""Write the fields and particles of a run to files for other programs, a file for each series, on rank 0."""
+"""`eddies export`: rank 0 writes each series of fields or particles of a run to a file for other programs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ log = logging.getLogger("eddies")
 
 PRODUCTS = ("ground_truth", "reconstruction", "rollout")
 Provenance = Mapping[str, Any]
-Series = Mapping[str, Mapping[str, Any]]  # of fields and particles, by group and name
+Series = Mapping[str, Mapping[str, Any]]  # by group ("fields" or "particles") and name
 
 
 def run(run_directory: Path, output: Path, comm: Comm, layout: str = "vtkhdf") -> None:
@@ -55,13 +55,13 @@ def _export(run_directory: Path, output: Path, alone: Comm, layout: str) -> None
     if not written:
         what, scene = (("particles that make a data set", " with a scene that has [tracers]")
                        if layout == "lagrangebench" else ("fields or particles", ""))
-        raise ProductError(f"{run_directory}: holds no {what}, which would be in "
-                           f"{' and '.join(f'{kind}.h5' for kind in PRODUCTS)}; run `eddies dns SCENE`{scene} first")
+        raise ProductError(f"{run_directory}: has no {what} in {', '.join(f'{kind}.h5' for kind in PRODUCTS[:-1])} or "
+                           f"{PRODUCTS[-1]}.h5; run `eddies dns SCENE`{scene} first")
 
 
 @contextmanager
 def _stored(kind: str, run_directory: Path, alone: Comm) -> Iterator[tuple[Series, Provenance]]:
-    """All series of a product that holds them."""
+    """Open the fields and particles that a product stores."""
     with open_product(alone, run_directory / f"{kind}.h5", kind) as file:
         yield {group: {name: reader(file, name) for name in file.get(group, ())}
                for group, reader in (("fields", FieldSeries), ("particles", Trajectory))}, read_provenance(file)
@@ -69,14 +69,14 @@ def _stored(kind: str, run_directory: Path, alone: Comm) -> Iterator[tuple[Serie
 
 @contextmanager
 def _rollout(run_directory: Path, alone: Comm) -> Iterator[tuple[Series, Provenance]]:
-    """All series of the rollout, stored or computed."""
-    from eddies.workflows.rollout.measured import open_rollout  # torch
+    """Open all series of the rollout, stored or computed."""
+    from eddies.workflows.rollout.measured import open_rollout  # needs torch
     with open_rollout(run_directory, alone) as measured:
         yield measured.exported, measured.provenance
 
 
 def _cube_of(series: Any) -> tuple[float, np.ndarray]:
-    """Edge and first corner of the cube: of fields reconstructed from measured tracks in their unit and coordinates."""
+    """Edge and lower corner of the cube; for fields reconstructed from tracks, in the unit and frame of the tracks."""
     if isinstance(series, FieldSeries) and "about" in series.file:
         about = series.file["about"].attrs
         return BOX_LENGTH * float(about["length_unit"]), -about["corner"]
@@ -92,7 +92,7 @@ def _write(output: Path, case: str, group: str, series: Any, provenance: Provena
         log.info("export: %s is left out: a data set holds particles only", case)
         return False
     if group == "particles" and "position" not in series.columns:
-        log.info("export: %s is left out: its rows belong to other tracks in each frame", case)
+        log.info("export: %s is left out: a row is not the same track in all frames", case)
         return False
     if data_set and (problem := shortcoming(series)):
         log.warning("export: %s is left out: %s", case, problem)

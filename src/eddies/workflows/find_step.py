@@ -43,7 +43,7 @@ from eddies.workflows.run_directory.fingerprints import stage_provenance
 
 log = logging.getLogger("eddies")
 
-TURNOVERS = 0.25  # of a short rollout
+TURNOVERS = 0.25  # duration of a short rollout in turnover times
 # Largest share of the error that a step may add, and relative change of the velocity that is always allowed.
 OF_ERROR, OF_VELOCITY = 0.02, 1e-4
 # Largest number of halvings of a step.
@@ -115,8 +115,8 @@ class Ladder:
 
     Parameters
     ----------
-    tried : makes the rollout with a step on a stretch; called for a rung when it is first needed.
-    stretches : of all ground truths. The search is on the first; a step must converge on the others too.
+    tried : runs the rollout with a step on a stretch, when a rung is first needed.
+    stretches : one for each ground truth. The search is on the first; a step must converge on the others too.
     integrator, first, evaluations : name, longest step, and evaluations of the rates in a step.
     """
 
@@ -174,7 +174,7 @@ def cheapest(ladders: Sequence[Ladder]) -> tuple[Ladder, int] | None:
 
 
 def cheaper(ladder: Ladder, best: Ladder, of_best: int) -> int | None:
-    """The longest converged step of a ladder, if it costs less than the best step so far."""
+    """The rung of the longest converged step of a ladder that costs less than the best one so far, or None."""
     most = best.evaluations / best.size(of_best)
     shortest = max((rung for rung in range(HALVINGS) if ladder.evaluations / ladder.size(rung) <= most), default=-1)
     most_seconds = CHEAPER * best[of_best].seconds
@@ -207,7 +207,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         for path, truth in zip(paths, truths):
             if truth.total != truths[0].total:
                 raise SceneError(f"{scene.name}: [simulation] confirmed_on: {path} holds {truth.total} particles, not "
-                                 f"{truths[0].total}; name a run with as many")
+                                 f"{truths[0].total}; name runs with the same number of particles")
         every = round(settings.frame_interval / scene.tracers.frame_interval)
         stretches = [Stretch(truth, settings.frame_interval, every) for truth in truths]
         span = float(stretches[0].stops[-1])
@@ -216,7 +216,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         if best is None:
             smallest = min(trial.step.size for ladder in ladders for trial in ladder.trials.values())
             raise SceneError(f'{scene.name}: [simulation] step = "converged": no step down to {smallest:.2g} has '
-                             "converged; give a number")
+                             "converged; give the step as a number")
         ladder, rung = best
         found, half, difference = ladder[rung], ladder[rung + 1], ladder.difference(rung + 1)
         tables = {each.integrator: each.table() for each in ladders if each.trials}
@@ -230,13 +230,13 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             "turnovers": span / stretches[0].turnover})
         for name, table in tables.items():
             write_table(file, f"trials/{name}", table)
-    log.info("find-step: found %s, %s %.4g, %.3g s per turnover. Halving it changes the velocity by %.4f and gives the "
-             "error %.4f", found.step.integrator, "Courant number" if settings.on_grid else "step", found.step.size,
+    log.info("find-step: found %s with %s %.4g, %.3g s per turnover. Half of it changes the velocity by %.4f and has "
+             "the error %.4f", found.step.integrator, "Courant number" if settings.on_grid else "step", found.step.size,
              found.seconds, difference, half.error)
 
 
 def integrators(settings: Simulation, span: float) -> Iterator[tuple[str, float, int]]:
-    """The integrators to search, each with its longest step in a time `span` and its evaluations in a step."""
+    """Yield name, longest step and evaluations per step of each integrator to search; a rollout lasts a time `span`."""
     if settings.on_grid:
         yield "etdrk4", MOST_COURANT, ETDRK4.evaluations
         return

@@ -32,12 +32,12 @@ from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.ground_truth.scene_flow import given_spectrum, stored_states
 from eddies.workflows.variants import Step, steps
 
-LARGEST_MACH = 0.3           # turbulent Mach number; density fluctuations are of about its square
-LEAST_REYNOLDS = 5.0         # Re_lambda from which on larger scales transfer energy to smaller ones
+LARGEST_MACH = 0.3           # turbulent Mach number; relative density fluctuations are about its square
+LEAST_REYNOLDS = 5.0         # Re_lambda above which large scales transfer energy to small ones
 KMAX_ETA = 1.0, 4.0          # the least that resolves the dissipation, and more than any purpose needs
-MOST_STEPS = 10**9           # of a flow or rollout, and frames: a quarter of an hour at a microsecond each
+MOST_STEPS = 10**9           # steps of a flow or rollout, or frames: a quarter of an hour at a microsecond each
 MOST_FORCED = 50             # how many times the energy of a flow the forcing may add in one step
-SILENCE = -40.0              # logarithm of a share of the energy that is round-off
+SILENCE = -40.0              # logarithm of the share of the energy below which only round-off remains
 # Largest turnover time at the release of tracers over the expected one; the least Re_lambda for which it holds.
 LATER, TURBULENT = 3.0, 20.0
 
@@ -111,7 +111,7 @@ def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
 
 
 def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
-    """Yield unstable or decayed flows, too many steps, frames, ranks or bytes, and too few frames."""
+    """Yield problems: an unstable or decayed flow, too many steps, frames, ranks or bytes, too few frames."""
     scene, stages, expected = step.scene, step.stages, estimate(step.scene)
     tracers, turbulence = scene.tracers, expected.turbulence
     if "dns" in stages:
@@ -125,7 +125,7 @@ def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]
             yield from _too_many_frames(tracers, tracers.turnovers * turbulence.turnover_time)
     if "simulate" in stages:
         yield from _too_many_rollout_steps(scene.simulation, turbulence.turnover_time if turbulence else 0.0)
-    # The turnover time of a flow that decays before the tracers start, or is hardly turbulent, has no limit.
+    # No upper limit of the turnover time is known if the flow decays before the tracers start, or is hardly turbulent.
     decays = scene.spin_up is not None and scene.forcing is None
     if tracers is not None and turbulence is not None and turbulence.reynolds_lambda >= TURBULENT and (
             not decays and step.holder("dns") / STAGES["dns"].file in made):
@@ -145,7 +145,7 @@ def _strong_forcing(initial: Initial, forcing: Forcing, time: Time) -> Iterator[
         energy, gained = unit * initial.amplitude**2, forcing.injection_rate * step
         if gained > MOST_FORCED * energy:
             least = math.sqrt(gained / MOST_FORCED / unit)
-            yield (f"[initial] amplitude = {initial.amplitude:g}: an energy of {energy:.2g}, to which [forcing] "
+            yield (f"[initial] amplitude = {initial.amplitude:g}: the flow has the energy {energy:.2g}, and [forcing] "
                    f"injection_rate = {forcing.injection_rate:g} adds {gained:.2g} in one step of {step:g}, which is "
                    f"unstable; raise amplitude to {least:.2g} or more, or lower injection_rate or [time] max_step")
 
@@ -176,7 +176,7 @@ def _too_many_frames(tracers: Tracers, span: float) -> Iterator[str]:
 def _too_many(key: str, value: float | str, step: float, span: float) -> Iterator[str]:
     if not span <= MOST_STEPS * step:  # also where one is not a number
         yield (f"{key} = {value}: {span / step:.1e} steps of {step:.3g} for a time of {span:.3g}, more than the limit "
-               f"of {MOST_STEPS:.0e}; raise it, or lower the turnovers or the duration of the run")
+               f"of {MOST_STEPS:.0e}; raise this key, or lower the turnovers or the duration of the run")
 
 
 def _too_few_frames(tracers: Tracers, turnover_time: float, check: Callable[[int], None]) -> Iterator[str]:
@@ -186,19 +186,19 @@ def _too_few_frames(tracers: Tracers, turnover_time: float, check: Callable[[int
         try:
             check(frames)
         except SceneError as error:
-            yield f"with at most {frames} frames, as expected of [tracers] turnovers = {tracers.turnovers:g}: {error}"
+            yield f"[tracers] turnovers = {tracers.turnovers:g} is expected to give at most {frames} frames: {error}"
 
 
 def _large_files(needs: Mapping[str, Disk], ranks: int) -> Iterator[str]:
     """Products that are too large for rank 0 to write for all."""
     for stage, needed in needs.items():
         if (size := (needed.kept or 0.0) - needed.beside) > LARGEST_BYTES:
-            yield (f"{STAGES[stage].file}: this h5py is built without MPI, so that rank 0 writes for {ranks} ranks, up "
-                   f"to {in_units(LARGEST_BYTES)} a file, and this will take {in_units(size)}; {REMEDY}")
+            yield (f"{STAGES[stage].file}: this h5py is built without MPI, so rank 0 writes for {ranks} ranks, at most "
+                   f"{in_units(LARGEST_BYTES)} a file, but this file will take {in_units(size)}; {REMEDY}")
 
 
 def place_problems(stages: Sequence[str], comm: Comm, directory: Path) -> list[str]:
-    """A run directory that cannot be used, or a file or directory in it with the name of a product."""
+    """Problems of a run directory: it cannot be used, or a file or directory in it blocks the name of a product."""
     def look() -> list[str]:
         if directory.is_dir() and not os.access(directory, os.W_OK | os.X_OK):
             return [f"{directory}: cannot be written; change its permissions, or choose another directory"]
@@ -218,8 +218,8 @@ def place_problems(stages: Sequence[str], comm: Comm, directory: Path) -> list[s
 
 
 def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
-    """Unfit files: the initial flow, trained weights, other ground truths. A missing GPU. Weights that earlier steps
-    make are not read."""
+    """Problems of the files that stages read (initial flow, trained weights, other ground truths), or a missing GPU.
+    Weights that earlier steps make are not read."""
     scene, stages, model = step.scene, step.stages, step.scene.model if "train" in step.stages else None
     try:
         if "dns" in stages and scene.initial.flow.from_file and scene.tracks is None:
@@ -287,24 +287,24 @@ def resolution(flow: Flow, turbulence: Turbulence) -> Iterator[str]:
 
 
 def convenient(cells: int) -> int:
-    """The next even number of cells with few prime factors, at most 7; other grids take longer to transform."""
+    """The next even number of cells with small prime factors, at most 7; transforms of other grids are slower."""
     factors = [2 * 3**threes * 5**fives * 7**sevens for threes in range(4) for fives in range(4) for sevens in range(2)]
     return min(factor << (-(-cells // factor) - 1).bit_length() for factor in factors)
 
 
 def compressibility(flow: Flow, speed: float | None) -> Iterator[str]:
-    """Sound too slow for the flow."""
+    """A sound speed too low for the flow."""
     sound = flow.sound_speed
     if speed is None or sound is None or speed <= LARGEST_MACH * sound:
         return
     reason = "the flow is supersonic, and shocks are not resolved" if speed > sound else (
-        f"above {LARGEST_MACH:g}, and fluid, balanced start and models assume a nearly uniform density")
+        f"above {LARGEST_MACH:g}, but the fluid, its initial density and the models assume a nearly uniform density")
     yield (f"[flow] sound_speed = {sound:g}: the turbulent Mach number is about {speed / sound:.2g}: {reason}; raise "
            f"sound_speed to {at_least(speed / LARGEST_MACH)} or more")
 
 
 def laminar_flow(flow: Flow, turbulence: Turbulence) -> Iterator[str]:
-    """Viscosity that leaves no turbulence."""
+    """A viscosity too high for turbulence."""
     reached = turbulence.reynolds_lambda
     if reached < LEAST_REYNOLDS:
         why = ("the flow is laminar" if reached < 1 else f"below {LEAST_REYNOLDS:g}, and eddies decay without making "
@@ -348,8 +348,8 @@ def untrained_terms(model: Model, training: Training) -> Iterator[str]:
 def rollout_steps(settings: Simulation, allowed: float | None, model: Model, units: StepUnits) -> Iterator[str]:
     """Steps of the particles that are longer than a forced flow or a term allows."""
     if allowed and settings.longest_step > allowed * (1 + 1e-9):
-        yield (f"[simulation] step = {settings.step:g}: the particles will take shorter steps, of about "
-               f"{at_most(allowed)}, in which their resolved velocity can follow the flow; lower it to that")
+        yield (f"[simulation] step = {settings.step:g}: is too long for the resolved velocity to follow the flow, so "
+               f"the particles will take steps of about {at_most(allowed)}; lower step to {at_most(allowed)}")
     for name, term in model.settings.items():
         longest = term.longest_step(units)
         if settings.longest_step > longest:
@@ -364,9 +364,9 @@ def beyond_truth(settings: Simulation, tracers: Tracers, seen: float) -> Iterato
     """
     left = (1 - (seen if settings.start is None else settings.start)) * tracers.turnovers
     if settings.turnovers > left * (1 + 1e-9) and not tracers.forced:
-        yield (f"[simulation] turnovers = {settings.turnovers:g}: the ground truth ends {left:.3g} turnovers after its "
-               f"start, and later frames are compared with nothing; lower it to {at_most(left)}, or raise [tracers] "
-               f"turnovers to {at_least(tracers.turnovers * settings.turnovers / left)}")
+        yield (f"[simulation] turnovers = {settings.turnovers:g}: the ground truth ends {left:.3g} turnovers after the "
+               f"start of the rollout, so later frames cannot be compared; lower it to {at_most(left)}, or raise "
+               f"[tracers] turnovers to {at_least(tracers.turnovers * settings.turnovers / left)}")
 
 
 def two_digits(rounded: Callable[[float], int], value: float) -> str:
@@ -399,7 +399,7 @@ def check_ground_truth(stages: Sequence[str], scene: Scene, comm: Comm, director
     ranks call it."""
     path = directory / STAGES["dns"].file
     with open_product(comm, path, "ground_truth") as file:
-        if "particles" not in file:  # measured tracks, of which none is there in all frames; only fields are made
+        if "particles" not in file:  # of measured tracks, none of which is in all frames; only fields are made
             return
         check_frames(stages, scene.tracers, scene.own_training, scene.simulation, scene.seen_in(directory),
                      len(Trajectory(file, "tracers").times))

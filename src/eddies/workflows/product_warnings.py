@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from eddies.io.errors import make_again
 from eddies.io.hdf5 import File, read_attributes, stored_numbers
 from eddies.io.provenance import product_provenance
 from eddies.pipeline import MAKER_OF
@@ -17,12 +16,12 @@ Provenance = Mapping[str, Any]
 
 # Columns of a model's training that every step has; others are NaN in steps that do not compute them.
 OF_EVERY_STEP = "step", "phase", "seconds", "loss", "learning_rate", "gradient_norm"
-MOST_NAMED = 4  # places in a sentence
+MOST_NAMED = 4  # places that a sentence names
 
 
 def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
-    """Return a sentence for each product that was made from other products than those beside it. `provenance` has that
-    of each kind of product in a run directory."""
+    """Return a sentence for each product that was made from other products than those beside it. `provenance` holds
+    the provenance of each product in a run directory, by kind."""
     found = []
     for kind, origin in provenance.items():
         others = {needed: provenance.get(needed) for needed, known in origin.get("made_from", {}).items()
@@ -31,7 +30,7 @@ def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
             named = " and from ".join(_other(needed, origin, present) for needed, present in others.items())
             or_else = ("note that the report compares different flows or models" if any(others.values()) else
                        "restore the missing file")
-            found.append(f"{_made(kind, origin)} was made from {named}: {make_again(kind)}, or {or_else}")
+            found.append(f"{_made(kind, origin)} was made from {named}: {_make_again(kind)}, or {or_else}")
     return found
 
 
@@ -41,18 +40,18 @@ def changed_truths(origin: Provenance) -> list[str]:
     `origin` is the provenance of the model. Removed ground truths are skipped.
     """
     now = {path: product_provenance(path).get("id") for path in origin.get("truths", {})}
-    return [f"{_made('model', origin)} was trained on a {path} that has since changed; {make_again('model')}, or note "
-            "that the model has learned from another flow"
+    return [f"{_made('model', origin)} was trained on {path}, which has changed since then; {_make_again('model')}, or "
+            "note that the model has learned from another flow"
             for path, known in origin.get("truths", {}).items() if now[path] not in (None, known)]
 
 
 def not_finite(file: File, kind: str) -> str:
-    """Return a sentence on the numbers of an open product that are not finite; empty if all are. The last frame of a
-    series is read."""
+    """Return a sentence on the numbers of an open product that are not finite; empty if all are finite. Of a series,
+    only the last frame is read."""
     places = []
     for place, frame, values in stored_numbers(file):
         table, _, column = place.partition("/")
-        # A training does not compute every number in every step, and a search for a step has trials without an end.
+        # A training does not compute every number in every step, and a search for a step has trials that failed.
         gaps = kind == "step" or kind == "model" and table == "history" and column not in OF_EVERY_STEP
         # Scales without viscosity, and the sound speed of an incompressible fluid, are infinite.
         wrong = np.isnan(values) if kind == "ground_truth" else ~np.isfinite(values) & (not gaps)
@@ -63,8 +62,12 @@ def not_finite(file: File, kind: str) -> str:
         return ""
     more = f" and {len(places) - MOST_NAMED} more" if len(places) > MOST_NAMED else ""
     status = read_attributes(file, "rollout")["status"] if kind == "rollout" else "complete"
-    remedy = make_again(kind) if status == "complete" else f"the rollout {status}"
+    remedy = _make_again(kind) if status == "complete" else f"the rollout {status}"
     return f"{MAKER_OF[kind].file} holds numbers that are not finite ({'; '.join(places[:MOST_NAMED])}{more}): {remedy}"
+
+
+def _make_again(kind: str) -> str:
+    return f"remove {MAKER_OF[kind].file} and run `eddies {MAKER_OF[kind].name}` again"
 
 
 def _made(kind: str, origin: Provenance) -> str:
@@ -72,7 +75,7 @@ def _made(kind: str, origin: Provenance) -> str:
 
 
 def _other(kind: str, origin: Provenance, present: Provenance | None) -> str:
-    """Describe the product that another one was made from, compared with the `present` one."""
+    """Describe the product that another product was made from, and how it differs from the `present` one."""
     if present is None:
         return f"a {MAKER_OF[kind].file} that is not here"
     changes = changed_settings(MAKER_OF[kind], origin.get("scene"), present.get("scene"))

@@ -53,15 +53,15 @@ class Method(Protocol):
         """The modes at a time; collective."""
 
     def state_dict(self) -> dict[str, Any]:
-        """What the next frame needs of those before: tensors of modes, and plain values."""
+        """State from earlier frames that the next frame needs: tensors of modes, and plain values."""
         return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore that."""
+        """Restore a state from `state_dict`."""
 
 
 class LeastSquaresMethod:
-    """The solver of each frame alone; it starts from the modes of the frame before."""
+    """Least squares for each frame alone. The iteration starts from the modes of the previous frame."""
 
     def __init__(self, solver: ResolvedVelocity) -> None:
         self._solver = solver
@@ -80,7 +80,7 @@ class LeastSquaresMethod:
 
 
 class NeighbourMethod(Method):
-    """A form of reconstruction from the neighbours of each grid point, on a grid of modes."""
+    """Reconstructs the velocity at each grid point from its neighbours, and transforms it to modes."""
 
     def __init__(self, form: Form, grid: FourierGrid) -> None:
         self._form, self._grid = form, grid
@@ -95,13 +95,13 @@ class NeighbourMethod(Method):
 
 
 class Source:
-    """The particles of all frames, of measured tracks or of a ground truth; all ranks make one.
+    """Reads the particles of each frame, from measured tracks or from a ground truth; all ranks make one.
 
-    Parameters
+    Attributes
     ----------
     times : of the frames. spacing : mean distance of the particles. most : largest number of particles of a frame.
     truth : the ground truth with true fields; None for measured tracks.
-    unit, corner : of length, and the place of the origin of the tracks in the cube.
+    unit : unit of length of the scene, in that of the tracks. corner : position of the tracks' origin in the cube.
     """
 
     def __init__(self, scene: Scene, file: File, comm: Comm) -> None:
@@ -127,13 +127,13 @@ class Source:
 
 
 class ReconstructionRun:
-    """Reconstructs frame after frame into segments, from the start or from a checkpoint.
+    """Reconstructs frame after frame and writes them to segments, from the start or from a checkpoint.
 
     Parameters
     ----------
-    source : the particles. methods : of all particles and, if some are left out, of the others.
-    solver : whose grid has the modes. settings, tracers : [reconstruction] and [tracers].
-    viscosity, transfer : nu, and G of the filter that the particles follow.
+    source : the particles. methods : the method for all particles; with a holdout also one for those that remain.
+    solver : solver on the grid of the modes. settings, tracers : [reconstruction] and [tracers].
+    viscosity, transfer : nu, and the transfer function G of the filter whose velocity the particles follow.
     """
 
     def __init__(self, source: Source, methods: Sequence[Method], solver: ResolvedVelocity, settings: Reconstruction,
@@ -230,10 +230,10 @@ def sorted_rows(comm: Comm, most: int, columns: Mapping[str, np.ndarray]) -> dic
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Write reconstruction.h5: the quantities of [reconstruction] fields on a grid, and errors over time.
 
-    With u the velocity of the tracks, u* = u / G that before their filter, if they follow a filtered one, and P the
-    projection on solenoidal fields, the acceleration along a track is  -G P[div(u* u*)] + nu laplacian u + div(u u),
-    and the pressure G p[u*]. All are those of the modes that particles resolve, in the units of the tracks. A stopped
-    reconstruction continues from its newest checkpoint.
+    u is the velocity of the tracks, u* = u / G the velocity before their filter (G = 1 without a filter), and P the
+    projection on solenoidal fields. The acceleration along a track is -G P[div(u* u*)] + nu laplacian u + div(u u), and
+    the pressure is G p[u*]. All contain only the modes that the particles resolve, in the units of the tracks. A
+    stopped reconstruction continues from its newest checkpoint.
     """
     prepare_torch("cpu", comm)
     settings, tracers, directory = scene.reconstruction, scene.tracers, Path(directory)
@@ -276,7 +276,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
 
 def _maker(scene: Scene, comm: Comm, directory: Path, solver: ResolvedVelocity, weight: float,
            transfer: Tensor, truth: GroundTruth | None) -> Callable[[], Method]:
-    """A function that makes a new method of [reconstruction]."""
+    """Return a function that makes a new method of [reconstruction]."""
     settings, tracers = scene.reconstruction, scene.tracers
     if settings.method == "least-squares":
         return lambda: LeastSquaresMethod(solver)
@@ -296,8 +296,8 @@ class Quantities:
 
     Parameters
     ----------
-    modes : (3, kz, ky, kx) on `grid`. mean : of the velocity, (3,). transfer : G of the filter that it has passed.
-    viscosity : nu. wanted : names of RECONSTRUCTED. unit : of length.
+    modes : (3, kz, ky, kx) on `grid`. mean : mean velocity (3,). transfer : G of the filter of the velocity.
+    viscosity : nu. wanted : names in RECONSTRUCTED. unit : as in `Source`.
     """
 
     @torch.no_grad()
@@ -327,7 +327,7 @@ class Quantities:
         return {name: values.T for name, values in found.items()}
 
     def _of(self, values: Callable[[Tensor], np.ndarray]) -> dict[str, np.ndarray]:
-        """The quantities from the values (components, ...) of modes."""
+        """Compute the wanted quantities; `values` evaluates modes as an array (components, ...)."""
         given = {name: values(modes) for name, modes in self._modes.items()}
         velocity = given["velocity"]
         found = {"velocity": self.unit * (velocity + self.mean.reshape(3, *[1] * (velocity.ndim - 1)))}
@@ -345,7 +345,7 @@ class Quantities:
 
 def errors_of(modes: Tensor, mean: np.ndarray, tracers: Tracers, grid: FourierGrid, truth: GroundTruth,
               frame: int) -> dict[str, float]:
-    """Normalised L2 errors of the filtered velocity and its gradient at a frame whose field the ground truth has."""
+    """Normalised L2 errors of the filtered velocity and its gradient at a frame with a field in the ground truth."""
     slab = SlabDecomposition(grid.decomposition.comm, BOX_LENGTH, truth.fields.cells)
     target = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
     exact = truth.planes(truth.fields, truth.at_fields.index(frame), "velocity", slab)

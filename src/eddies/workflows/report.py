@@ -1,6 +1,6 @@
 """The report of a run: pages with the paper's figures, made from the products of the run, and the numbers as JSON.
 
-Every product is optional: a page has sections for the products that are there. All ranks measure a rollout together.
+Every product is optional: a page has sections for the products that exist. All ranks measure a rollout together.
 Each page is made, drawn and written by one rank.
 """
 
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eddies.analysis.isotropic_turbulence import StationarySpan
-from eddies.analysis.spectra import energy_spectrum, vorticity
+from eddies.analysis.spectra import vorticity
 from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import File, ProductError, in_files, open_product, read_attributes, read_table
@@ -57,16 +57,16 @@ ROLLOUT_COST = {"seconds_per_step": "rollout: seconds of a step (median, without
                 "particles": "particles of the rollout",
                 "ranks": "ranks of the rollout"}
 SIMULATION = "dns_seconds_per_turnover"
-SOURCE_OF_TRACKS = ("{in_file} measured tracks of {file}, {mean_count:.0f} at a time; {complete} are there in all "
-                    "frames. Fields are reconstructed from them by least squares. The dissipation rate is that of the "
-                    "literature for this velocity and integral scale.")
+SOURCE_OF_TRACKS = ("{in_file} measured tracks from {file}, on average {mean_count:.0f} in a frame; {complete} are in "
+                    "all frames. Fields are reconstructed from them by least squares. The dissipation rate is the "
+                    "value of the literature for this velocity and integral scale.")
 MAIN_PAGE = 3  # the main page takes as long as this many other pages; so does a round of pages
 Row = dict[str, Any]
 
 
 @dataclass
 class Page:
-    """A page, as one rank makes it.
+    """A page of the report, made by one rank.
 
     directory: run directory of the products. seconds: wall seconds by stage. provenance: by product. not_finite: a
     sentence on each product with numbers that are not finite. images: figures as PNG files, by name.
@@ -102,8 +102,9 @@ class Page:
 class Run:
     """A run directory: its scene (None if there is no readable one), the rollouts of its variants, and its pages.
 
-    pages: directory of each variant that was run, the one of the main page in front. Without a rollout of a variant it
-    is the run directory itself, under the name "". output: directory of the reports; None: "report" in each directory.
+    pages: run directory of each variant that was run, by name; the main page comes first. If no variant has a rollout,
+    there is one page, of the run directory itself, under the name "". output: directory of the reports; None: "report"
+    in each directory.
     """
 
     directory: Path
@@ -205,8 +206,9 @@ def _make(stored: Run, comm: Comm, alone: Comm, stop: StopRequest,
         measured: dict[str, list[MeasuredRollout]] = {name: [] for name in names}
         for name in names:
             for where in stored.measured(name):
-                from eddies.workflows.rollout.measured import open_together  # needs torch
-                opened = files.enter_context(open_together(where, comm, alone))
+                from eddies.workflows.rollout.measured import open_rollout  # needs torch
+                opened = on_all_ranks(comm, lambda where=where: files.enter_context(open_rollout(where, alone)),
+                                      ProductError)
                 shown = where == stored.pages.get(name)
                 opened.measure(comm, makers[name], shown, shown and name == stored.main, truths)
                 measured[name].append(opened)
@@ -250,7 +252,7 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
               main: bool) -> Page:
     """Read the products of a run directory and return its page, with figures that are not drawn.
 
-    scanned: results of the search for numbers that are not finite, by file, which are used and added to. The main page
+    scanned: results of the search for numbers that are not finite, by file; new results are added. The main page
     shows everything. Others have fewer figures, and no sections on products that are links to other directories.
     """
     page = Page(directory, read_stage_seconds(directory))
@@ -277,7 +279,7 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
                 page.not_finite[kind] = found
             page.cost += _cost(file, kind)
             if kind == "ground_truth" and "stationary" in file:
-                with contextlib.suppress(ProductError):  # its section says so
+                with contextlib.suppress(ProductError):  # the section about it shows the error
                     page.stationary = read_stationary_span(file)
             if main or not path.is_symlink():
                 page.sections += _sections_or_notice(kind, page, lambda: readers[kind](file))
@@ -322,11 +324,9 @@ def _ground_truth_sections(file: File) -> list[Section]:
     velocity = FieldSeries(file, name).read(-1, "velocity")
     middle = velocity.shape[1] // 2
     planes = {"velocity": velocity[0, middle], "vorticity": np.linalg.norm(vorticity(velocity), axis=0)[middle]}
-    if traced:
-        spectra = read_table(file, "spectra")
-    else:
-        wavenumber, energy = energy_spectrum(velocity)
-        spectra = {"wavenumber": wavenumber, "energy": energy[None]}
+    spectra = read_table(file, "spectra" if traced else "spectra_of_statistics")
+    if not traced:
+        spectra["energy"] = spectra["energy"][-1:]
     if not np.any(spectra["energy"]):
         return [Section("ground_truth", "Ground truth", notices=["The flow is at rest: its velocity is zero."])]
     source = {}
@@ -342,7 +342,9 @@ def _ground_truth_sections(file: File) -> list[Section]:
     if "particles/tracers" in file:
         power = read_attributes(file, "forcing")["injection_rate"] if "forcing" in file else 0.0
         found = tracer_statistics(Trajectory(file, "tracers"), spectra, reference["spacing"])
-        sections.append(tracers.section(found, reference, power))
+        scene = tomllib.loads(read_provenance(file)["scene"])
+        filtered = scene.get("tracks", scene.get("tracers", {})).get("filtered", True)
+        sections.append(tracers.section(found, reference, None if source else power, filtered))
     return sections
 
 
@@ -387,12 +389,12 @@ def _cost(file: File, kind: str) -> list[Metric]:
         elapsed = np.diff(statistics["time"])
         steps = (elapsed / statistics["time_step"][1:]).sum() / elapsed.sum() * turnover if len(elapsed) else None
         return [Metric("dns_seconds_per_step", "DNS: seconds of a step (median, without storing)", seconds),
-                Metric(SIMULATION, "DNS: wall seconds of a turnover (mean number of steps)",
+                Metric(SIMULATION, "DNS: wall seconds per turnover (median step, mean number of steps)",
                        None if steps is None else float(steps) * seconds, "the simulation took no step")]
     if kind != "rollout":
         return []
     attributes = read_attributes(file, "rollout")
-    untimed = "too few steps to time one: the first two, and the first two after a restart, are left out"
+    untimed = "too few steps to time: the first two, and the first two after a restart, are left out"
     found = [Metric(key, label, attributes.get(key), untimed) for key, label in ROLLOUT_COST.items()]
     if "evaluations" in attributes and attributes["turnovers"] > 0:
         found += [Metric("storing_share", "rollout: share of the wall time that storing took",

@@ -30,7 +30,7 @@ log = logging.getLogger("eddies")
 
 
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
-    """Simulate what a scene asks for and write rollout.h5.
+    """Run the rollout of a scene and write rollout.h5.
 
     A rollout whose state becomes faulty ends there, keeps its frames and reports the fault in its status. A stopped
     rollout continues from its newest checkpoint.
@@ -70,5 +70,5 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                     write_table(file, name, {"time": course.times, **columns})
     guard.checkpoints.remove()
     pace = (pace_in_words(outcome["seconds_per_step"], outcome["storing_share"]) if "seconds_per_step" in outcome
-            else "too few steps to time one")
-    log.info("rollout: %s after %.2f turnovers, %s", outcome["status"], outcome["time"] / turnover, pace)
+            else "too few steps to time")
+    log.info("rollout: %.2f turnovers, %s; %s", outcome["time"] / turnover, pace, outcome["status"])

@@ -1,4 +1,4 @@
-"""The state of run directories for a person: stages, their settings, checkpoints, jobs and sizes."""
+"""`eddies status`: the state of run directories: stages, their settings, checkpoints, jobs and sizes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def run(directory: Path, comm: Comm, verify: bool = False) -> None:
         complaint = None if old else _complaint(comm, path)
         damaged += complaint is not None
         _print(comm, complaint or
-               f"{path}: {'holds no checksums, made by an earlier version' if old else 'as written'}")
+               f"{path}: {'has no checksums, because an earlier version made it' if old else 'as written'}")
     if damaged:
         raise UserError(f"{directory}: {damaged} of {len(products)} products are damaged or cannot be read")
 
@@ -121,7 +121,7 @@ def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
     state = "to do"
     if page.is_file():
         old = any(path.stat().st_mtime > page.stat().st_mtime for path in products if path.is_file())
-        state = f"older than the products: `eddies report {directory}`" if old else f"complete, {page}"
+        state = f"older than the products; run `eddies report {directory}`" if old else f"complete, {page}"
     rows.append(("report", stage_seconds(directory).get("report"), state))
     width = max(len(title) for title, *_ in [*rows, ("train-kernel",)])
     for title, seconds, state in rows:
@@ -129,9 +129,9 @@ def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
 
 
 def stage_state(stage: Stage, directory: Path, settings: str, continued: str, text: str) -> str:
-    """The state of a stage in a directory in words.
+    """Describe in words the state of a stage in a directory.
 
-    `settings` and `continued` are fingerprints of the stage and of what it can continue, `text` is that of the scene.
+    `settings` is the fingerprint of the stage, `continued` that of the work it can continue, `text` the scene as TOML.
     """
     product = directory / stage.file
     origin = product_provenance(product)

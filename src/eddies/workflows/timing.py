@@ -31,7 +31,7 @@ from eddies.scene.scene import Scene, SceneError, Training
 from eddies.workflows import dns, find_step, reconstruct, report, simulate, train, train_kernel
 from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.ground_truth.frame_counts import TESTED_FRAMES
-from eddies.workflows.learned.model import load_kernel
+from eddies.workflows.learned.model import load_form
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.learned.training_data import training_data
 from eddies.workflows.learned.training_phases import horizon_phases, one_step_phases
@@ -40,9 +40,8 @@ from eddies.workflows.variants import steps
 
 log = logging.getLogger("eddies")
 
-RUN = {"dns": dns.run, "train-kernel": train_kernel.run,
-       "reconstruct": reconstruct.run, "train": train.run, "find-step": find_step.run,
-       "simulate": simulate.run}
+RUN = {"dns": dns.run, "train-kernel": train_kernel.run, "reconstruct": reconstruct.run, "train": train.run,
+       "find-step": find_step.run, "simulate": simulate.run}
 FEW = 4                      # steps of a training, and intervals of a rollout
 A_MOMENT = 1e-9              # turnovers of a spin-up or ground truth of as few steps as possible
 
@@ -60,14 +59,14 @@ class StepTimes(StopRequest):
 
 
 def run(scene: Scene, comm: Comm, signals: Sequence[int] = ()) -> None:
-    """Log seconds a step and wall time of each stage, of all variants, on one ground truth; all ranks call it. Raises
-    Stopped after a signal."""
+    """Log seconds per step and wall time of each stage of all variants, measured on one ground truth; all ranks call
+    it. Raises Stopped after a signal."""
     if scene.of_tracks:
-        raise SceneError(f"{scene.name}: `eddies check --time` shortens direct simulations, and this scene has "
-                         "[tracks]; run it, and read the times in the report")
+        raise SceneError(f"{scene.name}: `eddies check --time` cannot shorten a scene with [tracks]; run the "
+                         "scene, and read the times in its report")
     stop = StepTimes(comm, signals)
     log.info("%s: measured on %d %s", scene.name, comm.size, "rank" if comm.size == 1 else "ranks")
-    log.info("%-28s  s a step     steps  wall time", "stage")
+    log.info("%-28s    s/step     steps  wall time", "stage")
     few, failed = shortened(scene, None), set()
     try:
         with temporary_directory(comm) as directory:
@@ -91,12 +90,12 @@ def run(scene: Scene, comm: Comm, signals: Sequence[int] = ()) -> None:
                 in_files(comm, directory, lambda: write_files({directory / "scene.toml": few.to_toml()}))
                 measured("report", lambda: (elapsed(comm, lambda: report.run(directory, comm, stop=stop)), 0.0, 0))
     except Stopped:
-        raise Stopped(stop.reason, "from the beginning") from None
+        raise Stopped(stop.reason, "starts again from the beginning") from None
 
 
 def measured(name: str, measure: Callable[[], tuple[float, float, int | None]]) -> bool:
-    """Log the wall time of a stage, its seconds a step and its steps, as `measure` returns them; False where it
-    fails. An error with which HDF5 could not write a file is raised, because the job must then be aborted."""
+    """Log the wall time of a stage, its seconds per step and its steps, as `measure` returns them; False if it fails.
+    If HDF5 could not write a file, the error is raised, because the job must then be aborted."""
     try:
         with quiet():
             seconds, step, number = measure()
@@ -114,7 +113,7 @@ def measured(name: str, measure: Callable[[], tuple[float, float, int | None]]) 
 
 def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
                  stop: StepTimes) -> tuple[float, float, int | None]:
-    """Estimate a stage of the `whole` scene from a run of the short scene `few`.
+    """Estimate the cost of a stage of the `whole` scene from a run of the short scene `few`.
 
     Returns the wall time of the stage, the seconds of a step (including storing between steps), and the number of
     steps, None if unknown. A stage without equal steps has 0 steps.
@@ -151,14 +150,15 @@ def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
 
 def rest_of_training(definition: ModelDefinition, few: Training, frames: int, directory: Path, device: torch.device,
                      stop: StopRequest) -> tuple[float, int, float]:
-    """What a run with one step and `few` frames lacks: all `frames`, and the steps and validations of each phase.
+    """Estimate what a training with one step on few frames lacks: further frames, and steps and validations of phases.
 
-    Returns its wall time, the number of steps, and the seconds of a mean step.
+    Returns the wall time of this, the number of steps, and the mean seconds of a step.
     """
     comm, seconds, stepping, number = stop.comm, 0.0, 0.0, 0
     with open_truths(directory / STAGES["dns"].file, few.truth_files, definition.tracers, comm, device) as (
-            _, trained_on):
-        kernel = load_kernel(comm, directory / STAGES["train-kernel"].file) if few.field_weight > 0 else None
+            truth, trained_on):
+        kernel_file = directory / STAGES["train-kernel"].file
+        kernel = load_form(comm, kernel_file, truth.scales, truth.device).kernel if few.field_weight > 0 else None
         data = training_data(definition, few, trained_on)
         parameters = list(data[0].model.parameters())
         each_frame = elapsed(comm, lambda: [each.frames for each in data]) / few.frames
@@ -225,7 +225,7 @@ def quiet() -> Iterator[None]:
 
 
 def elapsed(comm: Comm, work: Callable[[], object]) -> float:
-    """Seconds in which all ranks do some work."""
+    """Wall seconds until all ranks have done some work."""
     comm.Barrier()
     began = time.perf_counter()
     work()

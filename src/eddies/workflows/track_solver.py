@@ -12,25 +12,25 @@ from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.exchanges import mean_over_ranks
-from eddies.particles.flow_units import FlowUnits, ReferenceScales
+from eddies.particles.flow_units import ReferenceScales
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import WEIGHT, ResolvedVelocity
 
-WEIGHTS = 10.0 ** np.arange(3, -1.1, -0.5)  # of the noise of least squares, of which cross-validation chooses one
-RISE = 1.02             # of the error of validation, at which the search ends
-HELD_OUT = 0.1          # share of the tracks that is left out for that
+WEIGHTS = 10.0 ** np.arange(3, -1.1, -0.5)  # weights of the noise in least squares; cross-validation chooses one
+RISE = 1.02             # of the validation error, at which the search ends
+HELD_OUT = 0.1          # share of the particles that cross-validation leaves out
 KNUTH = 2654435761      # spreads ids evenly over 32 bits
-NO_FILTER = 1e-3        # width of the filter of a whole flow, over the spacing
+NO_FILTER = 1e-3        # filter width over the spacing, for an unfiltered flow
 
 
 def best_solver(particles: ParticleSet, make: Callable[[float], ResolvedVelocity],
                 share: float = HELD_OUT) -> tuple[ResolvedVelocity, float, float]:
-    """The solver with the weight that predicts velocities best at the share of particles that the solve leaves out.
+    """Find the weight of the noise by cross-validation on a `share` of the particles that the solve leaves out.
 
-    `make` makes a solver of a weight. Returns it with its weight, and its error relative to the rms velocity. The
-    weight depends on the filter, on the errors of measured velocities and on the number of particles, none of which is
-    known well. Weights are tried from the largest on, until the error rises by a fiftieth. Where so few particles are
-    there that none is left out, the weight is the default, and the error NaN. Collective.
+    `make` makes the solver for a weight. Returns the best solver, its weight, and its error relative to the rms
+    velocity. The best weight depends on the filter, the errors of measured velocities and the number of particles,
+    none of which is known well. Weights are tried in descending order until the error rises by a fiftieth. If there
+    are too few particles to leave one out, the default weight is taken, and the error is NaN. Collective.
     """
     known, apart = split(particles, share)
     default = make(WEIGHT)
@@ -48,7 +48,7 @@ def best_solver(particles: ParticleSet, make: Callable[[float], ResolvedVelocity
 
 
 def split(particles: ParticleSet, share: float) -> tuple[ParticleSet, ParticleSet]:
-    """The particles without a share of all ids, and those of this share; the same on any number of ranks."""
+    """Split particles by id into the known ones and a `share` that is left out; the same on any number of ranks."""
     apart = particles.id * KNUTH % 2**32 < int(share * 2**32)
     known, held = (ParticleSet(particles.id[rows], particles.position[rows], particles.velocity[rows])
                    for rows in (~apart, apart))
@@ -66,14 +66,14 @@ def validation_error(solver: ResolvedVelocity, modes: torch.Tensor, known: Parti
 
 
 def solver_of(slab: SlabDecomposition, reference: Mapping[str, float], weight: float) -> ResolvedVelocity:
-    """The solver for particles with scales `reference`, of the attributes of a ground truth, and a weight."""
+    """The solver for a weight and the scales `reference`, named like the reference scales in a ground truth."""
     scales = ReferenceScales(
         velocity=reference["velocity_rms"], acceleration=reference["acceleration_rms"],
         **{name: reference[name] for name in ("filter_width", "spacing", "density_mean", "viscosity",
                                               "kolmogorov_length")})
-    return ResolvedVelocity.on_slabs(slab, FlowUnits(scales, cutoff=0.0, neighbors=0.0), weight=weight)
+    return ResolvedVelocity.on_slabs(slab, scales, weight=weight)
 
 
 def particles_on(slab: SlabDecomposition, columns: Mapping[str, np.ndarray]) -> ParticleSet:
-    """Particles of any rows, moved to the ranks whose slabs hold them; collective."""
+    """Make particles of rows that any rank holds, and move them to the ranks of their slabs; collective."""
     return ParticleSet.from_numpy(migrate(slab, dict(columns)))

@@ -35,20 +35,20 @@ from eddies.workflows.track_solver import NO_FILTER, best_solver, particles_on, 
 
 log = logging.getLogger("eddies")
 
-LEAST_TRACKS = 8        # that are there in all frames, for a model
+LEAST_TRACKS = 8        # in all frames, that a model needs
 INTEGRAL_SCALE = 0.2    # of the edge of the box: a guess, for estimates before the run
-ROUNDS = 20             # of the fixed point for the dissipation rate, each three times closer
+ROUNDS = 20             # iterations for the dissipation rate; each reduces the error to a third
 
 
 def with_tracks(scene: Scene, comm: Comm) -> Scene:
-    """A scene with [tracks] and the sections [flow] and [tracers] that follow from its file; all ranks call it.
+    """Return a scene with the sections [flow] and [tracers] that follow from the file of [tracks]; all ranks call it.
 
-    Raises SceneError or ProductError if the tracks do not fit, or the scene has other such sections.
+    Raises SceneError or ProductError if the tracks do not fit, or if the scene has these sections with other values.
     """
     settings = scene.tracks
     for name, each in {"": scene, **scene.variant}.items():
         if each.tracks != settings:
-            raise SceneError(f'variant "{name}": all variants have the same tracks; change [tracks] for the whole '
+            raise SceneError(f'variant "{name}": all variants must have the same tracks; set [tracks] for the whole '
                              "scene")
         for problem in _unfit(each):
             raise SceneError(problem)
@@ -56,19 +56,19 @@ def with_tracks(scene: Scene, comm: Comm) -> Scene:
     found = in_files(comm, settings.file, lambda: _sections_of(settings, learned))
     for name, own in found.items():
         if getattr(scene, name) not in (None, own):
-            raise SceneError(f"[{name}]: does not fit [tracks], which takes the place of this section; remove it")
+            raise SceneError(f"[{name}]: does not fit [tracks], which takes the place of this section; remove [{name}]")
     return replace(scene, **found, variant={name: replace(each, **found) for name, each in scene.variant.items()})
 
 
 def _unfit(scene: Scene) -> Iterator[str]:
-    """Sections and terms of a scene that tracks cannot serve."""
+    """Yield a message for each section or term of a scene that cannot be used with tracks."""
     settings, model, simulation = scene.tracks, scene.model, scene.simulation
     for name, default in (("initial", Initial()), ("forcing", None), ("spin_up", None)):
         if getattr(scene, name) != default:
-            yield f"[{name}]: [tracks] takes the place of this section; remove it"
+            yield f"[{name}]: [tracks] takes the place of this section; remove [{name}]"
     if scene.realisations is not None:
-        yield (f"realisations = {[*scene.realisations]}: the file has one realisation; remove the key, and give each "
-               "file a scene of its own")
+        yield (f"realisations = {[*scene.realisations]}: the file has one realisation; remove the key, and write a "
+               "scene for each file")
     if (wanted := scene.reconstruction) is not None:
         if settings.viscosity is None and (wanted.method == "memory" or "acceleration" in wanted.fields):
             yield ("[tracks] viscosity: this key is missing, and the method memory and the acceleration need it; give "
@@ -78,8 +78,8 @@ def _unfit(scene: Scene) -> Iterator[str]:
                    'volume that is not periodic lacks; set method = "least-squares" or "memory"')
     learned = [f"[{name}]" for name in ("kernel", "model", "simulation") if getattr(scene, name) is not None]
     if learned and not settings.filtered:
-        yield (f"[tracks] filtered = false: models are those of a filtered velocity; remove {', '.join(learned)}, or "
-               "set filtered = true if the tracks follow one")
+        yield (f"[tracks] filtered = false: models need a filtered velocity; remove {', '.join(learned)}, or set "
+               "filtered = true if the tracks follow a filtered velocity")
     if learned and settings.volume is not None:
         yield (f"[tracks] volume: models need particles in the whole periodic cube; remove {', '.join(learned)}, or "
                "give box if the flow is periodic")
@@ -91,15 +91,15 @@ def _unfit(scene: Scene) -> Iterator[str]:
         if settings.viscosity is None:
             yield '[tracks] viscosity: this key is missing, and [simulation] method = "eulerian" needs it; give it'
         if (scene.eulerian or Eulerian()).start != "particles":
-            yield ('[eulerian] start = "flow": the whole flow is not known where tracks are measured; set start = '
+            yield ('[eulerian] start = "flow": measured tracks do not give the unfiltered flow; set start = '
                    '"particles"')
 
 
 def _sections_of(settings: Tracks, learned: bool) -> dict[str, Flow | Tracers]:
     tracks = measured(settings)
     if learned and tracks.complete < LEAST_TRACKS:
-        raise SceneError(f"{settings.file}: {tracks.complete} of {tracks.about['in_file']} tracks are there in all "
-                         f"{len(tracks.times)} frames, and a model needs {LEAST_TRACKS}; give a part of the file with "
+        raise SceneError(f"{settings.file}: only {tracks.complete} of {tracks.about['in_file']} tracks are in all "
+                         f"{len(tracks.times)} frames, but a model needs {LEAST_TRACKS}; give a part of the file with "
                          "fewer frames")
     count = tracks.complete if learned else max(round((BOX_LENGTH / tracks.spacing) ** 3), LEAST_TRACKS)
     speed = float(np.sqrt(np.mean(tracks.columns["velocity"]**2)))
@@ -118,8 +118,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     """Write ground_truth.h5 of measured tracks; all ranks call it.
 
     Its filtered fields are those of the resolved velocity, which regularised least squares find in the velocities of
-    the tracks. If the tracks follow the whole flow, the filter is applied to it. The dissipation rate is that of the
-    literature for the measured velocity and integral scale (`dissipation_constant`).
+    the tracks. If the tracks follow the unfiltered flow, the filter is applied to it. The dissipation rate is the value
+    of the literature for the measured velocity and integral scale (`dissipation_constant`).
     """
     tracers, tracks = scene.tracers, TrackFrames(comm, scene.tracks)
     complete, times = tracks.complete, tracks.times
@@ -175,7 +175,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         write_attributes(file.create_group("tracks"), {
             **tracks.about, "complete": complete, "mean_count": tracks.mean_count, "weight": weight,
             "validation_error": error})
-    log.info("dns: %d tracks, %.0f at a time, %d in all %d frames, over %.3g T; u' = %.3g, L = %.3g",
+    log.info("dns: %d tracks, on average %.0f in a frame, %d in all %d frames; duration %.3g T, u' = %.3g, L = %.3g",
              tracks.about["in_file"], tracks.mean_count, complete, len(times),
              times[-1] / reference["eddy_turnover_time"], math.sqrt(2 * float(spectra[0][1].sum()) / 3),
              reference["integral_scale"])
@@ -184,7 +184,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
 class FrameFlow:
     """The velocity field of one frame.
 
-    Energies are those where the particles are, so that a margin without particles has no effect.
+    Energies are means over the region with particles, so a margin without particles has no effect.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ from eddies.scene.scene import Scene
 from eddies.workflows.ground_truth.frame_counts import last_seen
 from eddies.workflows.learned import transfer
 from eddies.workflows.learned.a_priori import evaluate, evaluation_frames
-from eddies.workflows.learned.model import load_kernel
+from eddies.workflows.learned.model import load_form
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.learned.training_data import model_for, training_data
 from eddies.workflows.learned.training_phases import feature_range, horizon_phases, one_step_phases, take_all_steps
@@ -47,7 +47,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     with open_truths(own_file, settings.truth_files, scene.tracers, comm, device) as (truth, trained_on):
         # Only the field loss averages with the kernel.
         kernel_file = directory / STAGES["train-kernel"].file
-        kernel = load_kernel(comm, kernel_file, truth.device) if settings.field_weight > 0 else None
+        kernel = load_form(comm, kernel_file, truth.scales, truth.device).kernel if settings.field_weight > 0 else None
         data, tests = training_data(definition, settings, trained_on), evaluation_frames(truth)
         model, dtype = data[0].model, data[0].dtype
         for each in data:
@@ -55,7 +55,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                      "window at t = %.3g of %.3g, are for validation", sum(p.numel() for p in model.parameters()),
                      each.learned, each.last - each.learned, each.truth.times[each.last], each.truth.times[-1])
         own = next((each.model for each in data if each.truth is truth), None)
-        # Where only other ground truths are trained on, no part of the run's own is seen.
+        # If the model is trained on other ground truths only, it has seen no part of the run's own.
         last = last_seen(settings.window if own is not None else 0.0, len(truth.times))
         guard = Guard(comm, directory / STAGES["train"].checkpoints, stage_fingerprint(scene, "train"), stop,
                       " of the training")
@@ -83,14 +83,14 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}
     save_weights(comm, directory / STAGES["train"].file, "model", description, weights, provenance, tables)
     guard.checkpoints.remove()
-    if curves is not None:  # after the product, which a picture must not put at risk
+    if curves is not None:  # after the product is written: a failing picture must not lose it
         curves.draw(training)
     errors = tables["a_priori"]
     beside = (f" (exact filtered pressure gradient {errors['pressure_gradient_error'][-1]:.3f})"
               if "pressure_gradient_error" in errors else "")
     since = "training window" if own is not None else "release of the tracers; trained on other ground truths"
-    log.info("model: a-priori acceleration error %.3f, a time of %.3g after the %s%s", errors["acceleration_error"][-1],
-             errors["delay"][-1], since, beside)
+    log.info("model: a-priori acceleration error %.3f%s, a time of %.3g after the %s", errors["acceleration_error"][-1],
+             beside, errors["delay"][-1], since)
 
 
 class LearningCurves:

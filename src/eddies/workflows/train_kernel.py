@@ -139,7 +139,7 @@ def losses_of(training: Training) -> dict[str, np.ndarray]:
 
 
 def shapes(kernels: dict[str, SmoothingKernel], support: float) -> dict[str, np.ndarray]:
-    """W h^3 and dW/dr h^4 over r/h."""
+    """W h^3 and dW/dr h^4 as functions of r/h."""
     r = torch.linspace(0, support, 201)
     table = {"r_over_h": (r / support).numpy()}
     for name, kernel in kernels.items():
@@ -165,7 +165,7 @@ def compare(kernels: dict[str, SmoothingKernel], sample: KernelSample) -> dict[s
 
 
 def errors_of_forms(kernel: SmoothingKernel, sample: KernelSample, scales: ReferenceScales) -> dict[str, float]:
-    """Errors on a field of the forms of reconstruction other than averages; collective."""
+    """Errors of OTHER_FORMS on a field; empty for a kernel that may be negative. Collective."""
     errors = {}
     for name in OTHER_FORMS if kernel.mean_volume is None else ():
         made = Form(name, kernel, scales.filter_width, scales.spacing**3).of(sample.particles)

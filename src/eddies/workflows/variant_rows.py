@@ -36,7 +36,7 @@ SEARCH = ("step_integrator", "step_size", "step_seconds", "step_error", "step_er
 BEFORE = ("weights", "training_seconds", "training_steps", *SEARCH)  # cost before the rollout
 THROUGH_KERNEL = ("qr_kl", "qr_kl_floor")  # measured on gradients that the smoothing kernel reconstructs
 # Turnovers after which training, search and rollout have taken less time than the direct simulation, and than the
-# cheapest grid with at most the velocity error: a number, or "never".
+# cheapest grid whose velocity error is not larger: a number, or "never".
 BREAK_EVEN = ("break_even_simulation", "break_even_grid")
 COLUMNS = ("name", "label", "method", "kind", "on_grid", "status", "stopped_at", "realisations", *MEASURES, "end",
            *COST, *BEFORE, *BREAK_EVEN, *(f"{measure}_spread" for measure in MEASURES), "settings")
@@ -99,8 +99,8 @@ def together(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def simulation_seconds(scene: Scene, rows: Sequence[Mapping[str, Any]], of_truth: float | None) -> float | None:
-    """Return the wall seconds of a turnover of the direct simulation: of the variant that repeats it, if there is one,
-    which is timed with the others, and of the ground truth otherwise."""
+    """Return the wall seconds per turnover of the direct simulation: of the variant that repeats it, because it is
+    timed like the others, or else of the ground truth."""
     repeated = [row["wall_seconds"] for row in rows if row["wall_seconds"] is not None
                 and (variant := scene.variant.get(row["name"], scene)).coarse_cells == variant.flow.cells]
     return min(repeated, default=of_truth)
@@ -109,8 +109,8 @@ def simulation_seconds(scene: Scene, rows: Sequence[Mapping[str, Any]], of_truth
 def add_break_even(rows: Sequence[dict[str, Any]], simulation: float | None) -> None:
     """Add the numbers of BREAK_EVEN to the rows of trained methods.
 
-    Compares mean errors at T/2, or at the end of shorter rollouts. The search of a grid counts. `simulation`: wall
-    seconds of a turnover of the direct simulation, None if unknown.
+    Compares mean errors at T/2, or at the end of shorter rollouts. The search for a grid's step counts too.
+    `simulation`: wall seconds per turnover of the direct simulation, None if unknown.
     """
     known = [row for row in rows if row["status"] == "complete" and row["wall_seconds"] is not None]
     measure = "velocity_error_half" if any(row["velocity_error_half"] is not None for row in known) else (
@@ -165,7 +165,7 @@ def notes(scene: Scene) -> list[str]:
         found.append(f"Largest wavenumber |k_i| that a grid keeps by the 2/3 rule: {kept}; k_d = "
                      f"{', '.join(f'{np.pi / width:.3g}' for width in sorted(widths, reverse=True))}.")
     if len({(variant.tracers.particles, variant.tracers.filter_width) for variant in variants.values()}) > 1:
-        found.append("Variants have different particles or filters. Compare those with the same ones.")
+        found.append("Variants have different particles or filters. Compare only those with the same ones.")
     return found
 
 

@@ -1,4 +1,4 @@
-"""The steps of a run: which stages work for which scene in which directory.
+"""The steps of a run: which stages run for which scene in which directory.
 
 A scene without variants and realisations has one step, in the run directory. Otherwise the run directory holds
 
@@ -38,7 +38,7 @@ class Step:
     ----------
     scene : the scene, without variants.
     stages : the stages, in order. All make a product.
-    directory : where they work.
+    directory : where they run.
     variant : name of the variant; None for what all variants share.
     links : for products that are made elsewhere, the directory of each by stage.
     """
@@ -62,7 +62,7 @@ class Step:
     def link(self) -> None:
         """Make the directory, and in it relative links to the products of other directories. One rank calls it.
 
-        A product of the step's own settings is kept; another one is replaced.
+        A product made with the settings of the step is kept; any other is replaced.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         for stage, holder in self.links.items():
@@ -106,14 +106,14 @@ def rollouts(scene: Scene, directory: Path) -> dict[str, list[Place]]:
 def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[str] = ()) -> list[Step]:
     """The steps for some stages of a scene, for all variants or those named, in order.
 
-    Rollouts take turns between the variants, so that a slow phase of the machine slows all of them. Products that use
+    Rollouts of the variants alternate, so that a slow phase of the machine slows all of them. Products that use
     trained weights of a file are never shared, because an earlier step may replace the file.
     """
     if not scene.variant and not scene.realisations:
         making = tuple(stage for stage in stages if stage in MAKING)
         return [Step(scene, making, directory)] if making else []
     whole, seeds = scene.without_variants, scene.realisations or ()
-    # The ground truths that a variant may use, each by its directory below that of the scene or of a realisation.
+    # Directory of each ground truth that a variant may use, below that of the scene or of a realisation.
     truths = {mark: path.parent for path, mark in set_files(whole).items()} or {stage_fingerprint(whole, "dns"): Path()}
     realisations = tuple(directory / f"{REALISATION}{seed}" for seed in seeds)
     places = rollouts(scene, directory)
@@ -121,7 +121,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
                                     if (name or scene.name) in places]
     used = [scene.variant[name].tracers if name else whole.tracers for name in chosen]
     planned: list[tuple[str | None, Place, Sequence[str]]] = []
-    # A ground truth for rollouts from its beginning; no model is needed there.
+    # The scene of a further ground truth: rollouts start at its beginning, and no model is trained.
     simulation = whole.simulation and replace(whole.simulation, method="none", start=0.0, confirmed_on=None)
     truth = replace(whole, model=None, training=None, eulerian=None, simulation=simulation)
     for own, where in [(whole, directory), *((truth.realisation(seed), place)

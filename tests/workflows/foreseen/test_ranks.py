@@ -67,7 +67,7 @@ def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(com
     slab, support = SlabDecomposition(comm, BOX_LENGTH, tracers.planes), scene.kernel_support
     time = frames * tracers.frame_interval
     drift = ALLOWED_VELOCITY * speed * time
-    assert accepted(lambda: ResolvedVelocity.on_slabs(slab, FLOW, drift)) == (comm.size <= by_grid)
+    assert accepted(lambda: ResolvedVelocity.on_slabs(slab, FLOW.scales, drift)) == (comm.size <= by_grid)
     far = torch.tensor([[1.0, 1.0, slab.upper + PEAK_VELOCITY * speed * time]], dtype=torch.float64)
     particles = ParticleSet(torch.tensor([comm.rank]), far, torch.zeros_like(far), torch.ones(1))
     around = Neighborhood(slab, support, 0.0)

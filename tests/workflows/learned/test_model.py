@@ -15,7 +15,7 @@ from eddies.particles.flow_units import ReferenceScales
 from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene.scene import Model, SceneError, load_scene
 from eddies.scene.terms import PRESETS
-from eddies.workflows.learned.model import (initial_model, load_form, load_kernel, load_model,
+from eddies.workflows.learned.model import (initial_model, load_form, load_model,
                                             take_from_first_rank)
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.run_directory.fingerprints import stage_provenance
@@ -165,8 +165,8 @@ def write_kernel(comm, directory, **description):
 def test_weights_of_the_former_kernel_that_could_be_negative_are_refused(comm, tmp_path):
     """Their files do not name a formula."""
     write_kernel(comm, tmp_path)
-    with pytest.raises(ProductError, match='kernel.h5: form = "NN g", .*`eddies train-kernel`'):
-        load_kernel(comm, tmp_path / "kernel.h5")
+    with pytest.raises(ProductError, match='kernel.h5: .* formula "NN g", .*`eddies train-kernel`'):
+        load_form(comm, tmp_path / "kernel.h5", SCALES)
 
 
 @pytest.mark.mpi(1, 2)
@@ -181,4 +181,4 @@ def test_another_form_of_reconstruction_keeps_weights_and_id(comm, tmp_path):
         loaded = load_form(comm, path, SCALES)
         assert loaded.name == form and loaded.support == pytest.approx(0.7)
         assert product_provenance(path)["id"] == identity
-    assert torch.equal(load_kernel(comm, path).value(distance), NETWORK.table().value(distance))
+    assert torch.equal(load_form(comm, path, SCALES).kernel.value(distance), NETWORK.table().value(distance))

@@ -12,8 +12,7 @@ from eddies.particles.rates import Rates
 from eddies.particles.terms.term import Coefficient, Term
 from eddies.scene import terms as declared
 
-# Two or more sweeps reduce all errors with eigenvalues between this over the squared number of sweeps and 1 to an
-# eighth.
+# Two or more sweeps reduce all errors whose eigenvalues lie between LEAST / sweeps^2 and 1 to an eighth.
 LEAST = 2.0
 
 

@@ -86,8 +86,8 @@ def compiled_network(network: nn.Module, settings: NetworkSettings, outputs: int
 def build_network(settings: NetworkSettings, outputs: int, seed: int) -> nn.Module:
     """Build the network of a term: from features (inputs, m) of pairs to outputs (outputs, m).
 
-    A network of the user is made as Network(inputs, hidden, outputs, seed). Raises TermError if that fails, or if the
-    class is no torch.nn.Module.
+    A network of the user is made by Network(inputs, hidden, outputs, seed). Raises TermError if that fails, or if the
+    class is not derived from torch.nn.Module.
     """
     inputs = len(settings.inputs) + ("density" in settings.inputs)
     if not is_path(settings.network):
@@ -101,8 +101,8 @@ def build_network(settings: NetworkSettings, outputs: int, seed: int) -> nn.Modu
 
 
 def outputs_of(network: nn.Module, features: Tensor, outputs: int) -> Tensor:
-    """Outputs (outputs, m) of a network for features (inputs, m) of pairs. TermError if a user's network fails, or
-    returns something else."""
+    """Outputs (outputs, m) of a network for features (inputs, m) of pairs. Raises TermError if a user's network fails
+    or returns another shape."""
     with users_code(type(network), TermError):
         found = network(features)
     if not isinstance(found, Tensor) or found.shape != (outputs, features.shape[1]):
@@ -155,10 +155,11 @@ class PairNetwork(PairTerm):
 
 
 class DensityFlux(PairTerm):
-    """d rho_i/dt = r_rms s sum_j w NN_rho, or w NN_rho sign(rho_i - rho_j), a function of the invariants of a pair.
+    """d rho_i/dt = r_rms s sum_j w NN_rho, or, with `sign`, r_rms s sum_j w NN_rho sign(rho_i - rho_j).
 
-    r_rms is the rms of the density rate and NN_rho a network of its own; w, s and the invariants are as in PairNetwork.
-    The paper does not state what replaces b_k for the density. The sign is taken from the public code.
+    r_rms is the rms of the density rate. NN_rho is a network of its own, a function of the invariants of a pair; w, s
+    and the invariants are as in PairNetwork. The paper does not state what replaces b_k for the density. The sign is
+    taken from the public code.
     """
 
     Settings = declared.DensityFlux

@@ -133,7 +133,7 @@ class Forcing(Term):
     """f(k) = A u(k) over 0 < |k| < k_f with A = P / sum |u*(k)|^2: linear forcing of the large scales (Lundgren 2003).
 
     The flow is forced by A u*, with u* = u / G its velocity before the filter (`flow/forcing.py`), and the power P is
-    the `injection_rate` of that flow. The filtered flow receives less, A sum |u(k)|^2. Each evaluation sets A.
+    the `injection_rate` of that flow. The filtered flow receives less, A sum |u(k)|^2. Each evaluation computes A.
     """
 
     Settings = declared.Forcing

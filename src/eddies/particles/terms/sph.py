@@ -100,8 +100,8 @@ class WCSPH(_SPHTerm):
     drive the pressure to zero. gamma is fixed, since it has no effect where the density hardly varies.
 
     This sum gives a poor pressure gradient among random particles. Differences (P_j - P_i)/(rho_i rho_j) halve the
-    error at single moments, but they do not conserve energy: it grows until the rollout ends, unless a shift keeps
-    particles in order, and then there is no gain.
+    error at single moments, but they do not conserve energy: it grows until the rollout stops. A shift that keeps the
+    particles in order prevents this, but then there is no gain.
     """
 
     Settings = declared.WCSPH
@@ -145,16 +145,18 @@ class WCSPH(_SPHTerm):
 
 
 class TransportVelocity(_SPHTerm):
-    """dx_i/dt = v_i + w_i: a constant background pressure p_b, acting for a time delta_t, spreads the particles evenly
-    (Adami, Hu & Adams 2013). The velocity follows the field along the shift w:
+    """dx_i/dt = v_i + w_i with a shift velocity w that spreads the particles evenly (Adami, Hu & Adams 2013).
+
+    A constant background pressure p_b that acts for a time delta_t causes w. The velocity v_i changes by (w_i.grad) v,
+    so that it remains the velocity of the field at the shifted particle:
 
         w_i = -(p_b delta_t/m) sum_j (V_i^2 + V_j^2) grad W,   V = m/rho
         (w_i.grad) v = sum_j V_j (v_j - v_i) (w_i.grad W)
 
     p_b delta_t is learned in units of rho_0 c h; its magnitude counts, since particles gather if it is negative. The
-    initial value 1/4 is that of the paper: pressure c^2 rho_0 and step h/(4c), for any step here. The paper has the
-    divergence of the stress v w instead of (w.grad) v. That conserves momentum. Its term v div w, however,
-    changes the velocity of random particles more than if they were not shifted.
+    initial value 1/4 is that of Adami et al., pressure c^2 rho_0 and step h/(4c); here it is used with any step. They
+    use the divergence of the stress v w instead of (w.grad) v. That conserves momentum. Its part v div w, however,
+    gives random particles a larger error of the velocity than a shift without any correction.
     """
 
     Settings = declared.TransportVelocity

@@ -60,7 +60,7 @@ class Estimates:
     Parameters
     ----------
     turbulence : sustained by the forcing, or decaying from a random start; None for other flows.
-    peak_speed : maximum of |u| + |v| + |w|; None for a flow from a file or of the user's without forcing.
+    peak_speed : maximum of |u| + |v| + |w|; None for a flow from a file or of the user, without forcing.
     rms_speed : rms of the velocity vector; None where `peak_speed` is None, and for a pure sound wave.
     mach : turbulent Mach number; None without sound.
     courant_step : longest step of the direct simulation that its Courant number allows.
@@ -71,7 +71,7 @@ class Estimates:
     resolved_shells : largest wavenumber along each axis of the resolved velocity of particles; 0 without tracers.
     allowed_step : longest step of particles with a resolved velocity, at the speed at which the tracers start.
     rollout_step : longest step of the rollout.
-    rollout : None also without a rollout, and for a method of the user's.
+    rollout : None also without a rollout, and for a method of the user.
     """
 
     turbulence: Turbulence | None
@@ -154,7 +154,7 @@ def expected_turbulence(flow: Flow, initial: Initial, forcing: Forcing | None) -
 
 
 def peak_speed(flow: Flow, initial: Initial, turbulence: Turbulence | None) -> float | None:
-    """Expected maximum of |u| + |v| + |w|; None for a flow from a file or of the user's without forcing."""
+    """Expected maximum of |u| + |v| + |w|; None for a flow from a file or of the user, without forcing."""
     if turbulence or initial.flow.turbulent:
         return PEAK_SPEED * (turbulence.velocity_rms if turbulence else initial.amplitude)
     if initial.flow.sound:
@@ -170,7 +170,7 @@ def rms_speed(initial: Initial, turbulence: Turbulence | None) -> float | None:
 
 
 def courant_step(flow: Flow, time: Time, speed: float | None) -> float | None:
-    """Longest step that the Courant number allows. An explicit stepper resolves sound."""
+    """Longest step that the Courant number allows. For an explicit stepper the speed of sound counts too."""
     sound = flow.sound_speed if time.explicit else None
     return None if speed is None else time.courant * BOX_LENGTH / flow.cells / (speed + math.sqrt(3) * (sound or 0.0))
 
@@ -199,5 +199,5 @@ def rollout_in(settings: Simulation, turnover_time: float, longest: float) -> Ro
 
 
 def _whole(ratio: float) -> int:
-    """The next whole number, which round-off does not raise."""
+    """Round up to a whole number; an excess of the order of round-off is ignored."""
     return math.ceil(ratio - 1e-9)

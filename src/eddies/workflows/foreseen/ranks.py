@@ -12,14 +12,14 @@ from eddies.scene.sections import NEIGHBORS
 from eddies.workflows.foreseen.numbers import expected_turbulence
 
 PEAK_VELOCITY = 4.0          # largest component of the velocity of a particle over u'
-ALLOWED_VELOCITY = 6.0       # the same, for which the training through horizons has ghost planes
+ALLOWED_VELOCITY = 6.0       # the same in the training through horizons, whose ghost planes allow for it
 GHOST_PLANES = {"cubic": 3, "quintic": 4}
 RESOLVED = "ghost planes of the resolved velocity"
 
 
 def most_ranks(scene: Scene) -> dict[str, int]:
-    """The largest number of ranks by what limits it; of variants, the limits that are stricter than the scene's."""
-    limits, tracers, simulation = {"a grid plane each": scene.flow.cells}, scene.tracers, scene.simulation
+    """The largest number of ranks for each limit. A limit of a variant is given if it is stricter than the scene's."""
+    limits, tracers, simulation = {"a grid plane for each rank": scene.flow.cells}, scene.tracers, scene.simulation
     skin = simulation.skin * scene.interaction_radius if simulation else 0.0
     trains = "train" in scene.stages
     learned_neighbors = scene.neighbors if trains and "pairs" in scene.model.reads else 0.0
@@ -84,8 +84,8 @@ def horizon_limits(horizons: Horizons | None, tracers: Tracers, velocity: float,
 
 def truth_limits(path: Path, horizons: Horizons | None, tracers: Tracers, neighbors: float,
                  resolves: bool) -> dict[str, int]:
-    """Limits of the training on a ground truth of another run, which may have other particles; empty if it is not
-    there."""
+    """Limits of the training on a ground truth of another run, which may have another number of particles; empty if
+    the file is missing."""
     reference = product_attributes(path, "reference")
     if "spacing" not in reference:
         return {}
@@ -99,7 +99,7 @@ def truth_limits(path: Path, horizons: Horizons | None, tracers: Tracers, neighb
 
 
 def rank_problems(limits: Mapping[str, int], ranks: int) -> Iterator[str]:
-    """The problem of more ranks than the strictest limit."""
+    """Yield a message if there are more ranks than the strictest limit allows."""
     reason = min(limits, key=limits.__getitem__)
     if ranks > limits[reason]:
         yield (f"{ranks} ranks are more than the limit of {limits[reason]} ({reason}); start at most {limits[reason]}. "
@@ -107,7 +107,7 @@ def rank_problems(limits: Mapping[str, int], ranks: int) -> Iterator[str]:
 
 
 def reach_limit(tracers: Tracers, reach: float, when: str = "") -> dict[str, int]:
-    """The limit by the distance over which particles act on each other."""
+    """The limit from the distance `reach` over which particles act on each other; `when` ends its name."""
     return {f"slabs no thinner than the particles' reach {reach:.3g}{when}": thick_slabs(tracers.planes, reach)}
 
 

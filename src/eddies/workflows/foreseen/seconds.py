@@ -1,4 +1,4 @@
-"""Wall time of a stage by a formula, for batch requests: within a factor of three. `eddies check --time` measures.
+"""Wall time of a stage by a formula, for batch requests: within a factor of three. `eddies check --time` measures it.
 
     seconds = START + (transforms x TRANSFORM + pairs x (PAIR + weights x WEIGHT)) / ranks
             + calls x (CALL + ROUNDS x (ranks - 1) x MESSAGE)
@@ -15,14 +15,15 @@ from eddies.time_stepping import ETDRK4, STEPPERS
 from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_FRAMES
 
-# Seconds on one and two cores of an AMD EPYC with AVX-512 (`tiny`, `hit-small`, `hit-coarse`): a transform of a grid
-# point (1 + cells / CACHED times that where planes outgrow the caches), a pair, a weight of a network for a pair, an
-# evaluation or iteration without its work, a message; a stage without work.
+# Measured seconds on one and two cores of an AMD EPYC with AVX-512 (`tiny`, `hit-small`, `hit-coarse`). TRANSFORM: of
+# a grid point, times 1 + cells / CACHED in the direct simulation, whose planes outgrow the caches. PAIR: of a pair of
+# particles. WEIGHT: of a weight of a network, for each pair. CALL: overhead of an evaluation or iteration. MESSAGE: of
+# a message; a call has ROUNDS of them for each further rank. START: overhead of a stage.
 TRANSFORM, CACHED, PAIR, WEIGHT, CALL, MESSAGE, ROUNDS = 4e-9, 550, 2.5e-8, 6e-11, 2.5e-4, 2e-6, 4
 START = {"dns": 0.4, "train-kernel": 0.7, "reconstruct": 1.0, "train": 1.0, "find-step": 0.5, "simulate": 0.3,
          "report": 2.3}
 FORM_PAIRS = {"average": 1, "linear": 5, "quadratic": 8, "kriging": 27}  # cost of a neighbour, in averages
-SEARCH, CONFIRM = 2, 0.75    # turnovers of rollouts that a search takes, and each further ground truth of it
+SEARCH, CONFIRM = 2, 0.75    # turnovers of the rollouts of a search, and of those on each further ground truth
 COLD, ITERATION = 25, 12     # iterations of a solve without a first guess; transforms of a point in each
 GRADIENT = 4                 # an evaluation with its gradient, over an evaluation
 

@@ -18,8 +18,8 @@ from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_PAR
 
 # A process before any field, without and with torch; a report with its figures.
 FLOW_PROCESS, TORCH_PROCESS, REPORT_PROCESS = 100e6, 285e6, 280e6
-# Direct simulation: a cell in float64, and the arrays of two planes that are worked on, by whether the fluid is
-# compressible; a tracer.
+# Direct simulation, by whether the fluid is compressible: bytes of a cell in float64, and number of work arrays of two
+# planes. Bytes of a tracer.
 CELL_BYTES, BLOCK_ARRAYS, TRACER_BYTES = {True: 320, False: 220}, {True: 64, False: 32}, 300
 # Evaluation of a model: a particle, a point of its grid, a listed neighbour. Training of the kernel: a neighbour of a
 # grid point, a particle in the table of a field.
@@ -63,8 +63,8 @@ def flow_memory(flow: Flow, tracers: Tracers | None, ranks: int) -> float:
 
 
 class Disk(NamedTuple):
-    """Bytes that a stage leaves in the run directory, None where they are unknown, those of files that it removes at
-    its end, and those that it leaves in other files than its product."""
+    """Disk of a stage in bytes. kept: what it leaves in the run directory, None if unknown. scratch: files that it
+    removes at its end. beside: the part of `kept` that is not in its product."""
 
     kept: float | None
     scratch: float = 0.0
@@ -78,14 +78,14 @@ def disk(scene: Scene, stage: str) -> Disk:
         k_max, intervals = flow.largest_wavenumber, expected.frame_intervals
         statistics = (SAMPLE_BYTES + 8 * (math.ceil(math.sqrt(3) * k_max) + 1)) * ((expected.steps or 0) // EVERY)
         state = flow.components * (2 * k_max + 1) ** 2 * (k_max + 1) * 2 * flow.real_bytes
-        checkpoints = KEPT * state    # with the one that is written; the last one stays
+        checkpoints = KEPT * state    # KEPT + 1 while one is written; one stays, in `state`
         if tracers is None:
             return Disk(state + statistics + 4 * flow.components * flow.cells**3, checkpoints, state)
         during, after = (
             trajectory_bytes(flow, tracers, frames,
                              len(whole_frames(scene.simulation, scene.training, tracers.field_every, frames)))
             for frames in (intervals or 0, (intervals or 0) + 1))
-        if tracers.sets:  # each with the statistics, beside a ground truth with the final fields and no last state
+        if tracers.sets:  # each has the statistics; the run directory has the final fields and no last state
             after += len(tracers.sets) * statistics + 4 * flow.components * flow.cells**3
             state = 0
         return Disk(None if intervals is None else state + statistics + after, checkpoints + during, state)

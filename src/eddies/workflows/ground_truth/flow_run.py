@@ -31,9 +31,9 @@ from eddies.workflows.ground_truth.frame_counts import whole_cells
 class FlowRun:
     """A fluid and its state, the time stepper, the clock and the history.
 
-    `guard` is called before each step; after it `watch` ends a run that has become unstable. `phase` is "spin-up",
-    "start" (of what follows), "run" from the time `began` on, or "tracers", in which `tracers` is set. `max_step`
-    limits the steps with tracers, in addition to `step_limit`.
+    `guard` is called before each step; `watch` is called after it and ends an unstable run. `phase` is "spin-up",
+    "start" (before the next phase begins), "run" (from the time `began` on) or "tracers" (then `tracers` is set).
+    `max_step` limits the steps with tracers, in addition to `step_limit`.
     """
 
     fluid: Fluid
@@ -164,14 +164,14 @@ class TracerRun:
     """Releases tracers into a flow, or takes them from a checkpoint, and follows them to the end.
 
     Within a frame interval all steps are equal: the longest allowed steps that divide it, so that frames are equally
-    spaced. `released` is the sample of the flow at the release, `sets` are the sets by name, "" for an only one.
+    spaced. `released` is the sample of the flow at the release, `sets` are the sets by name, "" for a single one.
 
     Parameters
     ----------
-    flow : its forcing ends at the release unless [tracers] forced.
+    flow : its forcing ends at the release unless [tracers] forced is true.
     segments : the files for the frames.
     settings, seed : [tracers], and the seed of random places.
-    whole : gives, for a number of frames, those (with filtered fields) at which the unfiltered flow is stored.
+    whole : takes the number of frames; returns those, all with filtered fields, that store the unfiltered flow.
     saved : the checkpoint, or None.
     """
 
@@ -260,13 +260,13 @@ class TracerRun:
 
 
 def grid_of(fine: SpectralGrid, cells: int) -> SpectralGrid:
-    """A grid of so many cells, with all modes of a finer grid that it can hold."""
+    """A grid with `cells` cells along an axis and all modes of a finer grid that it can hold."""
     slab = SlabDecomposition(fine.decomposition.comm, fine.decomposition.length, cells)
     return SpectralGrid(slab, fine.precision, min(fine.cutoff, (cells - 1) // 2))
 
 
 def suffix_of(name: str) -> str:
-    """The end of the names of a set's series and arrays; empty for the only set, ""."""
+    """The end of the names of a set's series and arrays; empty for a single set, whose name is ""."""
     return name and f"-{name}"
 
 
@@ -283,7 +283,7 @@ def frame_layout(settings: Tracers, compressible: bool, cutoff: int) -> FrameLay
 
 
 def series_of(name: str) -> dict[str, str]:
-    """The series of a set among those of `frame_layout`, by the names that they have in its ground truth."""
+    """The names of a set's series in `frame_layout`, each with its name in the ground truth of the set."""
     return {f"{series}{suffix_of(name)}": series for series in ("tracers", "filtered")} | {"unfiltered": "unfiltered"}
 
 
@@ -293,6 +293,6 @@ def saved_modes(grid: SpectralGrid, modes: np.ndarray) -> Block:
 
 
 def restored_modes(grid: SpectralGrid, saved: Checkpoint, dimensions: int, name: str = "modes") -> np.ndarray:
-    """The part of this rank in a block of modes of a checkpoint, an array of so many dimensions."""
+    """This rank's part of the modes in a checkpoint, an array with the given number of dimensions."""
     start, stop = grid.column_starts[grid.decomposition.rank:][:2]
     return saved.read(name, int(start), int(stop), axis=dimensions - 2)

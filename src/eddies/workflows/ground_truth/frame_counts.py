@@ -11,14 +11,14 @@ from collections.abc import Sequence
 
 from eddies.scene.scene import SceneError, Simulation, Tracers, Training
 
-HELD_OUT = 0.1               # share of the training window that validates, at its end; at least the longest horizon
+HELD_OUT = 0.1               # share of the training window, at its end, for validation; at least the longest horizon
 KERNEL_FIELDS = 4            # filtered fields that the kernel is trained on
 TESTED_FRAMES, TESTED_PARTICLES = 9, 20_000  # of the a-priori test, which stores the rates of the particles
 
 
 def check_frames(stages: Sequence[str], tracers: Tracers, training: Training | None, simulation: Simulation | None,
                  seen: float, frames: int) -> None:
-    """Raise SceneError where one of the stages finds too few frames; `training` is None for weights of another run."""
+    """Raise SceneError if there are too few frames for a stage; `training` is None for weights of another run."""
     at_fields = range(0, frames, tracers.field_every)
     if "train" in stages:
         if training is not None and seen > 0:
@@ -34,8 +34,8 @@ def last_seen(window: float, frames: int) -> int:
 
 
 def last_trained_on(settings: Training, frames: int) -> int:
-    """The last frame that a model is trained on; the later frames of the window validate. Raises SceneError where too
-    few remain."""
+    """The last frame that a model is trained on; the later frames of the window are for validation. Raises SceneError
+    if too few frames remain."""
     last = last_seen(settings.window, frames)
     longest = max(settings.horizons.frames) if settings.horizons else 0
     held_out = max(math.ceil(HELD_OUT * last), longest, 2)  # rates need a frame on both sides
@@ -48,21 +48,21 @@ def last_trained_on(settings: Training, frames: int) -> int:
 
 
 def trained_frames(settings: Training, frames: int, at_fields: Sequence[int]) -> tuple[list[int], int]:
-    """The frames that are trained on, and the last frame that validates. A field loss that compares with the flow needs
-    a filtered field one frame later. Raises SceneError where too few remain."""
+    """The frames for training, and the last frame for validation. A field loss that compares with the flow needs a
+    filtered field one frame later. Raises SceneError if no frame remains."""
     learned, last = last_trained_on(settings, frames), last_seen(settings.window, frames)
     fields = set(at_fields)
     usable = [frame for frame in range(1, last) if not settings.wants_fields or frame + 1 in fields]
     trained, held_out = ([frame for frame in usable if (frame <= learned) == seen] for seen in (True, False))
     if not trained or not held_out:
-        raise SceneError('[training] field_target = "flow": no filtered field is stored one frame after any that is '
-                         f"{'held out' if trained else 'trained on'}; lower [tracers] field_every, or set "
+        raise SceneError('[training] field_target = "flow": no filtered field is stored one frame after any frame '
+                         f"that is {'held out' if trained else 'trained on'}; lower [tracers] field_every, or set "
                          'field_target = "tracers"')
     return trained, held_out[-1]
 
 
 def between_frames(frames: int, at_fields: Sequence[int]) -> list[int]:
-    """The frames with a filtered field and with frames on both sides; raises SceneError without any."""
+    """The frames that have a filtered field and a frame on both sides. Raises SceneError if there is none."""
     usable = [frame for frame in at_fields if 0 < frame < frames - 1]
     if not usable:
         raise SceneError("[tracers] field_every: no filtered field is stored between the first and the last frame; "
@@ -77,14 +77,14 @@ def rollout_start(settings: Simulation, tracers: Tracers, seen: float, frames: i
     last = frames - 2 - round(settings.frame_interval / tracers.frame_interval)
     usable = [frame for frame in at_fields if wanted <= frame <= last]
     if not usable:
-        raise SceneError(f"[simulation] start: from frame {wanted} of {frames} on, no filtered field is followed by "
-                         f"ground truth for {settings.frame_interval:g}, the first frame interval; lower start, "
+        raise SceneError(f"[simulation] start: from frame {wanted} of {frames} on, no frame has a filtered field and "
+                         f"one more frame interval of the rollout ({settings.frame_interval:g}) after it; lower start, "
                          "frame_interval, [training] window or [tracers] field_every, or raise [tracers] turnovers")
     return usable[0]
 
 
 def whole_frames(settings: Simulation | None, training: Training | None, every: int, frames: int) -> set[int]:
-    """The frames at which the unfiltered state is stored for coarse grids; filtered fields are stored `every` frames.
+    """The frames with the unfiltered state, for coarse grids. Every `every`-th frame has a filtered field.
 
     Rollouts start at these frames: at the start of [simulation], and, where the model is not trained on this ground
     truth, at the earliest frame.

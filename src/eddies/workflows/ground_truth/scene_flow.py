@@ -25,7 +25,7 @@ from eddies.spectral.spectral_grid import SpectralGrid, regrid
 
 log = logging.getLogger("eddies")
 
-MOST_REMOVED = 0.05  # of the energy of another code's flow, in a part with divergence; more is doubtful
+MOST_REMOVED = 0.05  # of the energy of another code's flow, in a part with divergence; more gives a warning
 
 
 def build_fluid(flow: Flow, forcing: Forcing | None, comm: Comm) -> Fluid:
@@ -96,7 +96,7 @@ def stored_states(initial: Initial, comm: Comm) -> Iterator[StoredStates | Veloc
     with open_states(comm, initial.file) as states:
         if initial.state >= len(states):
             raise SceneError(f"[initial] state = {initial.state}: {initial.path} holds {len(states)} states of the "
-                             f"whole flow, number 0 to {len(states) - 1}; name one of them")
+                             f"whole flow, with the numbers 0 to {len(states) - 1}; give one of these")
         yield states
 
 
@@ -117,7 +117,7 @@ def _state_from_file(initial: Initial, fluid: Fluid) -> np.ndarray:
     if "density" in stored:
         density = regrid(whole, grid, whole.forward(np.log(stored["density"])))
         if stored_speed not in (None, fluid.sound_speed):
-            # The same density would mean another pressure, and the part out of balance with the velocity is sound.
+            # The same density would mean another pressure. What is not in balance with the velocity becomes sound.
             density *= (stored_speed / fluid.sound_speed) ** 2
             if comm.rank == 0:
                 log.info("dns: the flow in the file has the sound speed %g; fluctuations of ln(density) are "
@@ -132,9 +132,9 @@ def _state_from_file(initial: Initial, fluid: Fluid) -> np.ndarray:
         log.info("dns: the velocity in %s has %.3g %% of its energy in a part with divergence, which is removed",
                  initial.path, 100 * removed)
         if removed > MOST_REMOVED and comm.rank == 0:
-            log.warning("[initial] path = %s: %.0f %% of the energy is in a part with divergence, so it may be no "
-                        "incompressible flow: its axes or components may be in another order than [z, y, x] and "
-                        "u, v, w, or its points too few for its smallest eddies", quoted(initial.path), 100 * removed)
+            log.warning("[initial] path = %s: %.0f %% of the energy is in a part with divergence: the flow may be "
+                        "compressible, its axes or components may be in another order than [z, y, x] and u, v, w, or "
+                        "its points may be too few for its smallest eddies", quoted(initial.path), 100 * removed)
     if not fluid.compressible:
         return solenoidal
     return np.concatenate([solenoidal, balanced_density(grid, solenoidal, fluid.sound_speed)[None]])

@@ -17,7 +17,7 @@ from eddies.parallel.slab import block_starts
 from eddies.scene.scene import BOX_LENGTH, SceneError
 from eddies.scene.sections import Tracks as Settings
 
-UNEQUAL = 0.01    # largest distance of a time from equal intervals, over the interval
+UNEQUAL = 0.01    # largest deviation of a time from equal intervals, over the interval
 SAME = 1e-3       # part of the longest interval below which two times are the same frame
 LEAST_FRAMES = 3
 MARGIN = 4.0      # spacings between a volume and its periodic image
@@ -33,8 +33,8 @@ class MeasuredTracks:
     columns : id (rows,), position and velocity (rows, 3), and density (rows,) over its mean, if it was asked for.
     throughout : whether the track of a row is there in all frames, (rows,).
     spacing : mean distance of the particles of a frame, in the volume in which they are.
-    unit : of length, in that of the file. corner : place of the file's origin.
-    about : words and numbers on the file and on what was left out.
+    unit : unit of length, in that of the file. corner : position of the file's origin in the cube, in that unit.
+    about : the attributes of the product that describe the file and the tracks.
     """
 
     times: np.ndarray
@@ -90,7 +90,7 @@ class TrackFrames:
         return self._block(lambda tracks: tracks.frame(number, complete))
 
     def shared(self, number: int, other: int) -> dict[str, np.ndarray]:
-        """This rank's block of the rows of a frame that another frame has too (`MeasuredTracks.shared`)."""
+        """This rank's block of the rows of a frame whose tracks are in another frame too (`MeasuredTracks.shared`)."""
         return self._block(lambda tracks: tracks.shared(number, other))
 
     def _block(self, rows: Callable[[MeasuredTracks], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -104,7 +104,7 @@ class TrackFrames:
 
 
 def measured(settings: Settings) -> MeasuredTracks:
-    """The tracks of a file; one rank calls it. Tracks with fewer than three rows that need a spline are left out.
+    """The tracks of a file; one rank calls it. If splines are needed, tracks with fewer than three rows are left out.
 
     Raises ProductError if the file is unfit, SceneError if it has too few frames.
     """
@@ -146,7 +146,7 @@ def _measured(settings: Settings, state: tuple[int, int] | None) -> MeasuredTrac
 
 
 def _at_frames(found: Tracks, settings: Settings) -> Tracks:
-    """The tracks at times 0, h, 2 h, ... in the unit of velocities, with six digits of h.
+    """The tracks at times 0, h, 2 h, ... in the time unit of the velocities; h is rounded to six digits.
 
     Raises SceneError for too few frames, unequal intervals or a frame without tracks.
     """
@@ -159,13 +159,13 @@ def _at_frames(found: Tracks, settings: Settings) -> Tracks:
     frame = np.rint((found.time - found.time[0]) / interval)
     off = np.abs(found.time - found.time[0] - frame * interval)
     if off.max() > UNEQUAL * interval:
-        raise SceneError(f"{path}: frames at equal intervals are needed, and with one of {interval:g} the frame at "
-                         f"time {found.time[np.argmax(off)]:g} is beside its place; interpolate the tracks to such "
-                         "times")
+        raise SceneError(f"{path}: frames at equal intervals are needed, but the frame at time "
+                         f"{found.time[np.argmax(off)]:g} does not fit the interval {interval:g}; interpolate the "
+                         "tracks to equal intervals")
     missing = np.setdiff1d(np.arange(last), frame)
     if len(missing):
         raise SceneError(f"{path}: no track is there at time {found.time[0] + missing[0] * interval:g} ({len(missing)} "
-                         "such frames); give a part of the file without such a gap")
+                         "such frames in all); give a part of the file without such a gap")
     return checked(replace(found, time=frame * float(f"{interval * settings.time_unit:.6g}")), path)
 
 

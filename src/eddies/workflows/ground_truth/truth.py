@@ -61,7 +61,7 @@ class GroundTruth:
         return migrate(self.decomposition, self.block(frame))
 
     def particles_with_rates(self, frame: int) -> dict[str, np.ndarray]:
-        """The same with `acceleration` (n, 3) and `density_rate` (n,), by centred differences along trajectories.
+        """`particles`, with `acceleration` (n, 3) and `density_rate` (n,), by centred differences along trajectories.
 
         Raises ValueError for the first and the last frame.
         """
@@ -94,7 +94,7 @@ class GroundTruth:
 
     @cached_property
     def at_states(self) -> list[int]:
-        """The frames at the times of the unfiltered flow; none of measured tracks."""
+        """The frames at the times of the unfiltered flow; none for measured tracks."""
         return [] if "tracks" in self._file else self._frames_of(self.states)
 
     def field_at(self, frame: int, points: torch.Tensor) -> np.ndarray:

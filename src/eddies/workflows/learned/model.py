@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import logging
-from collections.abc import Mapping
 from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,14 +14,14 @@ from torch.nn.parameter import is_lazy
 
 from eddies.io.hdf5 import ProductError
 from eddies.io.weights import load_weights
-from eddies.parallel.broadcast import first_complaint, share_text
+from eddies.parallel.broadcast import first_complaint, on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import any_rank
 from eddies.particles.flow_units import ReferenceScales
 from eddies.particles.forms import Form
 from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.smoothing_kernels import HermiteKernel, KernelNetwork
+from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene.scene import SceneError
 from eddies.scene.terms import TermError
 from eddies.workflows.learned.source import ModelDefinition
@@ -53,12 +50,12 @@ def take_from_first_rank(model: nn.Module, comm: Comm) -> None:
     """
     tensors = [*model.named_parameters(), *model.named_buffers()]
     own = [[name, _form(tensor)] for name, tensor in tensors]
-    first = json.loads(share_text(comm, json.dumps(own)))
+    first = on_first_rank(comm, lambda: own)
     wrong = next(((mine, other) for mine, other in zip_longest(own, first, fillvalue=["", "nothing"])
                   if mine != other), None)
     complaint = first_complaint(comm, wrong and (
         f"[model] terms: {' '.join(wrong[0]).strip()} on rank {comm.rank} is in the place of "
-        f"{' '.join(wrong[1]).strip()} on rank 0; register the same on all ranks, in the same order"))
+        f"{' '.join(wrong[1]).strip()} on rank 0; register the same tensors on all ranks, in one order"))
     if complaint is not None:
         raise SceneError(complaint)
     shapeless = next((name for name, tensor in tensors if is_lazy(tensor)), None)
@@ -97,8 +94,8 @@ def load_model(definition: ModelDefinition, comm: Comm, path: str | Path, scales
     """
     description, weights = load_weights(comm, path, "model")
     for key, wanted, trained in definition.differences(description):
-        raise ProductError(f"{path}: was trained with {key} = {trained}, and the scene has {wanted}; run "
-                           "`eddies train` again, or set the key to that")
+        raise ProductError(f"{path}: was trained with {key} = {trained}, but the scene has {wanted}; run "
+                           f"`eddies train` again, or set {key} = {trained}")
     model = initial_model(definition, scales, comm)
     expected = {name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}
     if expected != {name: tensor.shape for name, tensor in weights.items()}:
@@ -111,38 +108,27 @@ def load_model(definition: ModelDefinition, comm: Comm, path: str | Path, scales
 
 
 def particles_for(model: LagrangianModel, columns: dict[str, np.ndarray], device: torch.device) -> ParticleSet:
-    """The true particles as a start for a model; with their density only if the model integrates it."""
+    """The true particles as a start for a model. They have a density only if the model integrates it."""
     particles = ParticleSet.from_numpy(columns, device)
     return particles if model.integrates_density else replace(particles, density=None)
 
 
-def load_kernel(comm: Comm, path: str | Path, device: torch.device | str = "cpu") -> HermiteKernel:
-    """The trained kernel as a table in single precision.
-
-    Raises ProductError if the file cannot be read, or was trained with another formula of the kernel.
-    """
-    return _table_of(*load_weights(comm, path, "kernel"), path, device)
-
-
-def load_form(comm: Comm, path: str | Path, scales: ReferenceScales) -> Form:
+def load_form(comm: Comm, path: str | Path, scales: ReferenceScales, device: torch.device | str = "cpu") -> Form:
     """The form of field reconstruction that a kernel file names, with its kernel, for a flow of these scales.
 
-    Raises ProductError as `load_kernel`.
+    The kernel is a table in single precision. Raises ProductError if the file cannot be read, or was trained with
+    another formula of the kernel.
     """
     description, tensors = load_weights(comm, path, "kernel")
-    return Form(description.get("reconstruction", "average"), _table_of(description, tensors, path),
-                scales.filter_width, scales.spacing**3)
-
-
-def _table_of(description: Mapping[str, Any], tensors: Mapping[str, np.ndarray], path: str | Path,
-              device: torch.device | str = "cpu") -> HermiteKernel:
     network = KernelNetwork(description["support"], description["hidden"], description["cutoff"],
                             mean_volume=description.get("mean_volume"))
     formula = description.get("form", "NN g")
     if formula != network.formula:
-        raise ProductError(f'{path}: form = "{formula}", and the kernel of these settings is now "{network.formula}": '
-                           "remove it and run `eddies train-kernel` again")
+        raise ProductError(f'{path}: was trained with the formula "{formula}", but this version uses '
+                           f'"{network.formula}" for these settings: remove the file and run '
+                           "`eddies train-kernel` again")
     network = network.to(dtype=torch.float32, device=device)
     network.load_state_dict({name: torch.from_numpy(tensor) for name, tensor in tensors.items()})
     with torch.no_grad():
-        return network.table()
+        kernel = network.table()
+    return Form(description.get("reconstruction", "average"), kernel, scales.filter_width, scales.spacing**3)

@@ -58,7 +58,7 @@ class ModelDefinition:
         return {"terms": settings, "scales": scales.to_dict(), **neighbors}
 
     def differences(self, description: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
-        """Keys in which this definition differs from a stored description: key, value here, value there, as TOML.
+        """Yield key, value here and stored value, as TOML, where this definition differs from a stored description.
 
         Classes are compared by name, so that no class is imported because a file names it.
         """
@@ -69,7 +69,7 @@ class ModelDefinition:
         for term, trained in trained_terms.items():
             name, settings = short_name(term), self.model.settings[short_name(term)]
             wanted = json.loads(json.dumps(asdict(settings)))
-            # A description that is older than a key means the default of the key.
+            # If an older description lacks a key, the default of the key is meant.
             stored = {field.name: field.default for field in fields(settings) if field.default is not MISSING}
             stored = json.loads(json.dumps(stored)) | trained
             for key in wanted.keys() | stored.keys():
@@ -110,6 +110,6 @@ def read_source(scene: Scene, comm: Comm) -> ModelSource:
     except ProductError as error:
         raise ProductError(f"{scene.name}: [model] path = {quoted(scene.model.path)}: {error}") from None
     for key, wanted, trained in ModelDefinition.of(scene).differences(description):
-        raise SceneError(f"{scene.name}: {key} = {wanted}, but {path} was trained with {trained}; set it to "
-                         "that, or give another [model] path")
+        raise SceneError(f"{scene.name}: {key} = {wanted}, but {path} was trained with {trained}; set "
+                         f"{key} = {trained}, or give another [model] path")
     return ModelSource(path, description, weights, tables, provenance)

@@ -39,7 +39,7 @@ class TrainingData:
 
     Parameters
     ----------
-    definition, settings : of the model, and [training].
+    definition, settings : the definition of the model, and [training].
     truth : the ground truth, of this run or another.
     count : number of frames, and of windows, for training.
     like : a model with which the parameters are shared; None for new parameters.
@@ -84,7 +84,7 @@ class TrainingData:
         dynamics = ParticleDynamics(slab, self.model, 0.0, self.dtype, fixed_ranks=True, drift=drift)
         resolution = dynamics.resolution
         if resolution is None and settings.energy_weight > 0:
-            resolution = ResolvedVelocity.on_slabs(slab, self.model.flow, drift, self.dtype)
+            resolution = ResolvedVelocity.on_slabs(slab, self.model.flow.scales, drift, self.dtype)
         if resolution is not None:
             # Gradients are with respect to the particles alone, so an extrapolated start may not affect the result.
             resolution.tolerance_predicted = resolution.tolerance

@@ -1,6 +1,6 @@
 """The phases of a training, and the loop over its steps.
 
-Several ground truths take turns, one step each, and a validation error is the mean over them.
+If there are several ground truths, the steps alternate between them, and a validation error is the mean over them.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def horizon_phases(data: Sequence[TrainingData]) -> list[Phase]:
         # Each step through a window is evaluated, evaluated again in the backward pass, and differentiated.
         at_turn = [_at_turn(trainers, first + step) for step in range(settings.steps)]
         work = np.array([3.0 * trainer.steps_per_frame * horizon * trainer.total for trainer in at_turn])
-        # The error at the longest horizon validates all phases, because the last one is to minimise it.
+        # The error at the longest horizon validates all phases, because the last phase must minimise it.
         error = _mean(lambda trainer, window: trainer.validation_error(window, longest), trainers, held_out)
         return Phase(f"horizon {horizon}", work, rates, take, error, every)
 

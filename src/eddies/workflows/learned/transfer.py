@@ -64,7 +64,7 @@ def trained_on(source: ModelSource, path: str) -> tuple[dict[str, Any], dict[str
     """The run in which the weights of a source were trained, and the a-priori errors on the flow of that run.
 
     The run is `path`, with its Mach number, unless the source itself took its weights from another run. If it was
-    trained on ground truths of other runs only, these are given as `truths` with their Mach numbers, and no errors.
+    trained on ground truths of other runs only, these are `truths` with their Mach numbers, and the errors are None.
     """
     origin = source.provenance
     if "source" in origin:

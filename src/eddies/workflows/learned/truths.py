@@ -74,8 +74,8 @@ def _problems_of(file: File, settings: Training, tracers: Tracers, reads: Collec
     scales = truth.scales
     here, there = tracers.filter_width / tracers.spacing, scales.filter_width / scales.spacing
     if not math.isclose(here, there, rel_tol=1e-6):
-        yield (f"its filter is {there:.9g} mean spacings wide, and [tracers] filter_width = "
-               f"{tracers.filter_width:.9g} is {here:.9g}; give another run, or set filter_width = "
+        yield (f"its filter is {there:.9g} mean spacings wide, but [tracers] filter_width = "
+               f"{tracers.filter_width:.9g} is {here:.9g} mean spacings; give another run, or set filter_width = "
                f"{there * tracers.spacing:.9g}")
     if "density" in reads and not truth.has_density:
         yield ("holds no density, which the terms of [model] read; give a run of a compressible flow, or remove these "
@@ -83,11 +83,11 @@ def _problems_of(file: File, settings: Training, tracers: Tracers, reads: Collec
     if settings.batch > truth.total:
         yield f"holds {truth.total} particles, fewer than [training] batch = {settings.batch}; lower batch"
     if settings.field_weight > 0 and not math.isclose(tracers.spacing, scales.spacing, rel_tol=1e-6):
-        yield (f"its particles have a mean spacing of {scales.spacing:.4g}, and [training] field_weight = "
-               f"{settings.field_weight:g} averages with a kernel for {tracers.spacing:.4g}; remove field_weight, or "
-               "give another run")
+        yield (f"its particles have a mean spacing of {scales.spacing:.4g}, but [training] field_weight = "
+               f"{settings.field_weight:g} needs the spacing of the kernel, {tracers.spacing:.4g}; remove "
+               "field_weight, or give another run")
     interval = float(truth.times[1] - truth.times[0])
     if settings.horizons and not math.isclose(tracers.frame_interval, interval, rel_tol=1e-6):
-        yield (f"its frames are {interval:.6g} apart, and [training.horizons] counts frames of [tracers] "
-               f"frame_interval = {tracers.frame_interval:g}; make them equal, or leave the horizons out")
+        yield (f"its frames are {interval:.6g} apart, but [training.horizons] counts frames of [tracers] "
+               f"frame_interval = {tracers.frame_interval:g}; make both equal, or remove [training.horizons]")
     trained_frames(settings, len(truth.times), truth.at_fields)

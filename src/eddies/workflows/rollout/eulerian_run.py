@@ -22,7 +22,6 @@ from eddies.io.checkpoint import Checkpoint
 from eddies.io.weights import load_weights
 from eddies.parallel.migration import migrate
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.flow_units import FlowUnits
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.pipeline import STAGES
@@ -100,7 +99,7 @@ class EulerianRun:
         self.flow_seconds.append(time.perf_counter() - began)
         # A NaN fails this condition too.
         if not energy <= self.largest_energy:
-            return (f"step {number}: the coarse flow is unstable, its energy is {energy:.3g} and more than "
+            return (f"step {number}: the coarse flow is unstable: its energy {energy:.3g} is more than "
                     f"{RUNAWAY_ENERGY:g} times that of the start; lower [time] courant or [simulation] step")
         self.clock.tick(step)
         self.tracers.advance(self.state, step)
@@ -124,11 +123,11 @@ class EulerianRun:
         return ParticleSet.from_numpy(self.tracers.columns | density), torch.from_numpy(values[:, :3] + along)
 
     def status(self) -> str:
-        """Empty."""
+        """Return an empty text: the progress line shows nothing of this method."""
         return ""
 
     def series(self) -> dict[str, dict[str, list[float]]]:
-        """Empty."""
+        """Return no tables."""
         return {}
 
     def state_dict(self) -> dict[str, Any]:
@@ -160,8 +159,8 @@ class EulerianRun:
 
 def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float, directory: Path,
                damping: str | None) -> Closure | None:
-    """The closure of equations for a velocity that has passed a filter, or with `filter_width` = 0 the sharp cut-off of
-    the grid at its highest wavenumber k_c. The length Delta is then pi/k_c.
+    """The closure of the equations for a filtered velocity. With `filter_width` = 0 the filter is the sharp cut-off of
+    the grid at its highest wavenumber k_c, and the length Delta is pi/k_c.
 
     A learned closure takes the parameter `damping` of the terms in the model.h5 of the directory.
     """
@@ -183,18 +182,18 @@ def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float, dire
 
 
 def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame: int) -> np.ndarray:
-    """The modes of the true flow at a frame that the grid of a fluid holds, after a filter of the velocity.
+    """The modes of the true flow at a frame, on the grid of a fluid. The velocity is filtered with `filter_passed`.
 
     The density is read from the frame, or is in balance with a filtered velocity. Raises SceneError if the unfiltered
     flow is not stored at that frame.
     """
     grid, series = fluid.grid, truth.states
     if frame not in truth.at_states:
-        stored = ", ".join(f"{time / truth.times[-1]:.3g}" for time in series.times) or "no time"
+        stored = ", ".join(f"{time / truth.times[-1]:.3g}" for time in series.times)
+        remedy = f"only at {stored}; set [simulation] start to such a value, or make" if stored else "at no time; make"
         raise SceneError(
             f'[simulation] method = "eulerian": the rollout starts at {truth.times[frame] / truth.times[-1]:.3g} of the'
-            f" ground truth, which holds the unfiltered flow at {stored}; start there ([simulation] start), or make "
-            "the ground truth again for this start")
+            f" ground truth, which holds the unfiltered flow {remedy} the ground truth again for this start")
     slab = SlabDecomposition(grid.decomposition.comm, grid.decomposition.length, series.cells)
     whole = SpectralGrid(slab, grid.precision, (series.cells - 1) // 2)
 
@@ -215,13 +214,13 @@ def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame:
 
 @torch.no_grad()
 def state_of_particles(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame: int) -> np.ndarray:
-    """The modes that least squares find in the velocities of the true particles at a frame (`ResolvedVelocity`), with
-    their filter undone or kept, and a density in balance.
+    """The modes that least squares find in the velocities of the true particles at a frame (`ResolvedVelocity`). Their
+    filter is undone, unless the equations are for the filtered velocity. A density is in balance with the velocity.
 
     Modes beyond those that the particles resolve are zero.
     """
-    grid, units = fluid.grid, FlowUnits(truth.scales, cutoff=0.0, neighbors=0.0)  # no pairs
-    resolved = ResolvedVelocity.on_slabs(truth.decomposition, units).of(ParticleSet.from_numpy(truth.particles(frame)))
+    solver, grid = ResolvedVelocity.on_slabs(truth.decomposition, truth.scales), fluid.grid
+    resolved = solver.of(ParticleSet.from_numpy(truth.particles(frame)))
     modes = resolved.velocity if filter_passed else resolved.unfiltered
     velocity = regrid(resolved.grid.spectral, grid, as_numpy(modes))
     if not fluid.compressible:

@@ -1,4 +1,4 @@
-"""The rollout of a run directory and the true tracers beside it, and everything that is measured of both."""
+"""The rollout of a run directory, the true tracers beside it, and all measures of both."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ class OnDemand(dict):
 
 
 class MeasuredRollout:
-    """An open rollout of one rank. Measures are made once, when first used, or before by all ranks with `measure`.
+    """An open rollout on one rank. A measure is made once, when it is first used, or by all ranks with `measure`.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ class MeasuredRollout:
 
     @property
     def particles(self) -> dict[str, Any]:
-        """The particles of "model" and "truth" that have a frame."""
+        """The particles "model" and "truth" by name; those without frames are left out."""
         return {name: run for name, run in (("model", self.rollout.model), ("truth", self.rollout.truth))
                 if len(run.times)}
 
@@ -150,7 +150,7 @@ class MeasuredRollout:
 
         page: measure what a page shows, otherwise only what `accuracy` needs. every_frame: for a main page, measure the
         velocity gradient at all common frames and spectra at several. known: measures of true tracers from earlier
-        calls, which are used and added to. Other ranks than `root` keep no measures but those in `known`. ProductError
+        calls; new ones are added. Other ranks than `root` keep no measures but those in `known`. ProductError
         on all ranks if one of them cannot read a frame.
         """
         if self._solver is None:
@@ -205,19 +205,12 @@ class MeasuredRollout:
         return list(dict.fromkeys(tasks))
 
     def _key(self, task: Task) -> Any:
-        """Return the key of a measure in TruthMeasures; a measure of the model is the task itself, which is in none."""
+        """Return the key of a measure in TruthMeasures. For the model it is the task, which is never such a key."""
         quantity, of, frame = task
         if of == "model":
             return task
         kernel = (self._directory / "kernel.h5").resolve() if quantity != "spectra" else None
         return (self._directory / "ground_truth.h5").resolve(), kernel, quantity, int(self.rollout.truth.frames[frame])
-
-
-@contextmanager
-def open_together(directory: Path, comm: Comm, alone: Comm) -> Iterator[MeasuredRollout]:
-    """Open the rollout of a run directory on each rank; all ranks call it, and all raise the ProductError of one."""
-    with ExitStack() as files:
-        yield on_all_ranks(comm, lambda: files.enter_context(open_rollout(directory, alone)), ProductError)
 
 
 @contextmanager

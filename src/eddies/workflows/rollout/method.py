@@ -49,7 +49,7 @@ class Method(Protocol):
         """The state after the frames so far, as `CheckpointDirectory.write` takes it. No name begins with "rollout"."""
 
     def load_state_dict(self, saved: Checkpoint) -> None:
-        """Continue from a checkpoint, made on any number of ranks; on the same number exactly."""
+        """Continue from a checkpoint, made on any number of ranks; exact on the same number of ranks."""
 
 
 #: The classes behind the words of [simulation] method.

@@ -1,4 +1,4 @@
-"""Fields and spectra that one rank makes of particles at one time."""
+"""Fields and spectra that one rank computes from particles at one time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from eddies.analysis.rollout import Frames
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.flow_units import FlowUnits, ReferenceScales
+from eddies.particles.flow_units import ReferenceScales
 from eddies.particles.forms import Form, Reconstructed
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.particle_set import ParticleSet, as_numpy
@@ -23,7 +23,7 @@ GRADIENT = "velocity_gradient"
 
 
 class FieldsOfParticles:
-    """Fields that a form of reconstruction makes of particles. The results for the last frame are kept.
+    """Fields that a form of reconstruction computes from particles. The results for the last frame are kept.
 
     Parameters
     ----------
@@ -129,8 +129,8 @@ class ParticleSpectra:
     @cached_property
     def _resolution(self) -> ResolvedVelocity:
         cells = max(2 * round(0.875 * self.length / self.scales.spacing), 3)  # as `Tracers.planes`; 3 for the splines
-        units = FlowUnits(self.scales, cutoff=0.0, neighbors=0.0)  # no pairs
-        found = ResolvedVelocity.on_slabs(SlabDecomposition(self.alone, self.length, cells), units, dtype=torch.float32)
+        found = ResolvedVelocity.on_slabs(SlabDecomposition(self.alone, self.length, cells), self.scales,
+                                          dtype=torch.float32)
         found.most_iterations = MOST_ITERATIONS
         return found
 

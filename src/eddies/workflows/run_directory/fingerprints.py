@@ -16,7 +16,7 @@ from eddies.scene.scene import FOREIGN_IN, Scene
 from eddies.scene.sections import OF_A_SET
 
 
-# The keys of a stage that only say how long it goes on. One that differs in these alone can be continued.
+# The keys that only set the duration of a stage. If nothing else differs, a stage can continue from a checkpoint.
 DURATION_KEYS = {"dns": ("tracers.turnovers", "time.duration")}
 
 
@@ -33,7 +33,7 @@ def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> 
         "truths": _fingerprints(training.truth_files if training else ()),
         "found_step": _digest(simulation.step_file if simulation else None),
         "confirming": _fingerprints(simulation.confirming_files if simulation else ())}
-    if scene.sets:  # each has its own values, and all share the others
+    if scene.sets:  # OF_A_SET are the keys of each set; all sets share the others
         sets = settings["tracers"].pop("sets")
         settings["tracers"] = {key: value for key, value in settings["tracers"].items() if key not in OF_A_SET} | {
             "sets": {name: {key: sets[name][key] for key in OF_A_SET} for name in sorted(sets)}}
@@ -77,7 +77,7 @@ def _fingerprints(paths: Sequence[Path]) -> list[str | None]:
     """The fingerprints of ground truths, whose files may be too large to digest; None for a missing one."""
     if not paths:
         return []
-    from eddies.io.provenance import product_fingerprint  # h5py and mpi4py, only here
+    from eddies.io.provenance import product_fingerprint  # imports h5py and mpi4py
     return [product_fingerprint(path) for path in paths]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.provenance import product_provenance
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES, Stage
+from eddies.scene.layers import dotted
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Scene, Simulation
 from eddies.scene.sections import CONVERGED
@@ -55,8 +56,8 @@ class Work:
 
 
 def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Collection[str] = ()) -> Work:
-    """The work that stages of a scene find in a locked run directory; on one rank. The products of `links` are those of
-    other directories.
+    """The work that stages of a scene find in a locked run directory; on one rank. `links` are the
+    stages whose products are links to other directories.
 
     Raises ProductError if the system refuses to read a product or a checkpoint, which may be sound.
     """
@@ -73,7 +74,7 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
         of_sets = {path: product_provenance(directory / path) for path in sets}
         if complete and all(of_sets[path].get("fingerprint") == mark for path, mark in sets.items()):
             done.add(stage.name)
-            # Other settings may still be continued, and so may a direct simulation, for longer.
+            # Work of other settings may still be continued, and a direct simulation may go on for longer.
             if not of_others and stage.name != "dns":
                 useless.add(stage.name)
             continue
@@ -97,7 +98,7 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
         if of_others:
             useless.add(stage.name)
             if origin.get("course") in [fingerprint for _, fingerprint in checkpoints]:
-                continue  # the last state of the product, which is in the list
+                continue  # the last state of the product, which `lost` has already
             seconds_so_far = seconds.get(stage.name)
             cost = "" if seconds_so_far is None else f", took {duration(seconds_so_far)}"
             lost.append(f"{stage.checkpoints} (step {checkpoints[0][0]}{cost})")
@@ -144,7 +145,7 @@ def read_stage_seconds(directory: Path) -> dict[str, float]:
     try:
         return {stage: float(value) for stage, value in json.loads(path.read_text()).items()}
     except (AttributeError, TypeError, ValueError):
-        raise ProductError(f"{path}: is damaged; delete it, because the report can do without it") from None
+        raise ProductError(f"{path}: is damaged; delete it: the report does not need it") from None
 
 
 def changed_settings(stage: Stage, then: str | None, now: str | None) -> list[str]:
@@ -152,14 +153,14 @@ def changed_settings(stage: Stage, then: str | None, now: str | None) -> list[st
     text is missing or damaged."""
     stages = [STAGES[name] for name in (*stage.depends_on, stage.name)]
     try:
-        before, after = (dict(leaves(tomllib.loads(text or ""))) for text in (then, now))
+        before, after = (dict(dotted(tomllib.loads(text or ""))) for text in (then, now))
     except (TypeError, ValueError):
         return []
     if not before or not after:
         return []
-    return [f"{'.'.join(key)} = {_value(before, key)}, now {_value(after, key)}"
+    return [f"{key} = {_value(before, key)}, now {_value(after, key)}"
             for key in dict.fromkeys([*after, *before]) if before.get(key) != after.get(key)
-            and any(key[0] in each.reads and ".".join(key) not in each.but for each in stages)]
+            and any(key.partition(".")[0] in each.reads and key not in each.but for each in stages)]
 
 
 def of_other_settings(changes: Sequence[str]) -> str:
@@ -169,7 +170,7 @@ def of_other_settings(changes: Sequence[str]) -> str:
 
 
 def _check_readable(product: Path) -> None:
-    """Raise ProductError if the system refuses to read a product; a damaged content is no error here."""
+    """Raise ProductError if the system refuses to read a product; damaged content is not an error here."""
     try:
         open_to_read(product).close()
     except OSError as error:
@@ -185,14 +186,5 @@ def _cost(origin: Mapping[str, Any], seconds: float | None) -> str:
     return f" (made {origin['date']})" if seconds is None else f" (took {duration(seconds)})"
 
 
-def _value(settings: Mapping[tuple[str, ...], Any], key: tuple[str, ...]) -> str:
+def _value(settings: Mapping[str, Any], key: str) -> str:
     return quoted(settings[key]) if key in settings else "absent"
-
-
-def leaves(table: Mapping[str, Any], within: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """All values of nested tables, each with its keys."""
-    for key, value in table.items():
-        if isinstance(value, dict):
-            yield from leaves(value, (*within, key))
-        else:
-            yield (*within, key), value
