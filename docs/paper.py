@@ -23,10 +23,9 @@ from eddies import open_run
 from eddies.analysis.against_truth import EDGES, conditional_flows, last_invariants, pdf_divergence
 from eddies.analysis.pdfs import bin_edges, bin_probabilities, gaussian, kl_divergence, pdf, standardized
 from eddies.analysis.rollout import Rollout
-from eddies.report.figures import (BAR, DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SECOND, SIGNED, THIRD, TRUTH,
-                                   colour_bar, guide_power_law, largest, legend_at_foot, letter, note,
-                                   number_wavenumbers, panels, png, show_plane, styled)
-from eddies.report.rollout_figures import invariant_plane
+from eddies.report.figures import (DNS, FILTERED, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, guide_power_law,
+                                   legend_at_foot, letter, note, number_wavenumbers, panels, png, styled)
+from eddies.report.rollout_figures import invariant_plane, velocity_planes, vorticity_and_energy
 from eddies.stored_run import StoredRun
 from eddies.workflows.rollout.measured import open_rollout
 
@@ -95,48 +94,21 @@ def figure_3(numbers: dict[str, dict]):
     return figure
 
 
-@styled
 def figure_4(rollouts: dict[str, Rollout]):
     """Draw u_x in the plane z = pi over time: true tracers above, models below."""
-    figure, axes = panels(1 + len(rollouts), 4, (2.0, 2.0), right=BAR, sharex=True, sharey=True)
     first = next(iter(rollouts.values()))
     shown = first.common.spread(4)
-    rows = {"true tracers": [first.planes["truth"][first.common.truth[index]] for index in shown]}
-    for name, run in rollouts.items():
-        rows[MODELS[name][0]] = [run.planes["model"][run.common.model[index]] for index in shown]
-    limit = largest(*(plane.velocity[0] for plane in rows["true tracers"]))
-    for row, (name, planes) in zip(axes, rows.items()):
-        for axis, plane in zip(row, planes):
-            image = show_plane(axis, plane.velocity[0], (-limit, limit), SIGNED)
-        row[0].set_ylabel(f"{name}\n$y$")
-    for axis, index in zip(axes[0], shown):
-        axis.set_title(f"$t = {first.common.times[index] / first.turnover:.2f}\\,T$")
-    for axis in axes[-1]:
-        axis.set_xlabel("$x$")
-    colour_bar(figure, image, axes.flat, "$u_x$")
-    return figure
+    rows = {"true tracers": [first.both(first.planes, index)[1] for index in shown]}
+    rows |= {MODELS[name][0]: [run.both(run.planes, index)[0] for index in shown] for name, run in rollouts.items()}
+    return velocity_planes(rows, first.common.times[list(shown)] / first.turnover)
 
 
-@styled
 def figure_5(rollouts: dict[str, Rollout]):
     """Draw vorticity and kinetic energy in the plane z = pi at the end: true tracers, then models."""
-    figure, axes = panels(2, 1 + len(rollouts), (2.0, 2.0), right=BAR, sharex=True, sharey=True)
     first = next(iter(rollouts.values()))
-    planes = {"true tracers": first.planes["truth"][first.common.truth[-1]]}
-    planes |= {MODELS[name][0]: run.planes["model"][run.common.model[-1]] for name, run in rollouts.items()}
-    energy = {name: np.sum(plane.velocity**2, axis=0) / 2 for name, plane in planes.items()}
-    rotation = {name: plane.vorticity for name, plane in planes.items()}
-    for row, found, label in zip(axes, (rotation, energy), (r"$|\omega|$", r"$\frac{1}{2}|u|^2$")):
-        limit = largest(found["true tracers"])
-        for axis, (name, plane) in zip(row, found.items()):
-            image = show_plane(axis, plane, (0, limit), POSITIVE)
-        colour_bar(figure, image, row, label, extend="max")
-        row[0].set_ylabel("$y$")
-    for axis, name in zip(axes[0], planes):
-        axis.set_title(name)
-    for axis in axes[1]:
-        axis.set_xlabel("$x$")
-    return figure
+    last = len(first.common.times) - 1
+    return vorticity_and_energy({"true tracers": first.both(first.planes, last)[1],
+                                 **{MODELS[name][0]: run.both(run.planes, last)[0] for name, run in rollouts.items()}})
 
 
 @styled

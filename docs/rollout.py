@@ -5,42 +5,28 @@
 
 import io
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 from mpi4py import MPI
 from PIL import Image
 
-from eddies.report.figures import BAR, SIGNED, colour_bar, largest, panels, png, show_plane, styled
+from eddies.report.figures import png
+from eddies.report.rollout_figures import velocity_planes
 from eddies.workflows.rollout.measured import open_rollout
 
 SHOWN = 4  # times
 
 
-@styled
 def picture(run: Path, variants: list[str]) -> bytes:
     """The image; times are spread over the rollout of the first variant."""
-    rows, times = {}, None
-    for variant in variants:
-        with open_rollout(run / variant, MPI.COMM_SELF) as measured:
-            rollout = measured.rollout
-            shown = rollout.common.spread(SHOWN)
-            model, truth = zip(*(rollout.both(rollout.planes, index) for index in shown))
-            if times is None:
-                times = rollout.common.times[list(shown)] / rollout.turnover
-                rows["true tracers"] = [one.velocity[0] for one in truth]
-            rows[variant] = [one.velocity[0] for one in model]
-    figure, axes = panels(len(rows), SHOWN, (2.1, 2.0), right=BAR, sharex=True, sharey=True)
-    limit = largest(*rows["true tracers"])
-    for row, (name, planes) in zip(axes, rows.items()):
-        for axis, plane in zip(row, planes):
-            image = show_plane(axis, plane, (-limit, limit), SIGNED)
-        row[0].set_ylabel(f"{name}\n$y$")
-    for axis, time in zip(axes[0], times):
-        axis.set_title(f"$t = {time:.2f}\\,T$")
-    for axis in axes[-1]:
-        axis.set_xlabel("$x$")
-    colour_bar(figure, image, axes.flat, "$u_x$")
-    return png(figure)
+    with ExitStack() as files:
+        rollouts = {name: files.enter_context(open_rollout(run / name, MPI.COMM_SELF)).rollout for name in variants}
+        first = rollouts[variants[0]]
+        shown = first.common.spread(SHOWN)
+        rows = {"true tracers": [first.both(first.planes, index)[1] for index in shown]}
+        rows |= {name: [each.both(each.planes, index)[0] for index in shown] for name, each in rollouts.items()}
+        return png(velocity_planes(rows, first.common.times[list(shown)] / first.turnover))
 
 
 if __name__ == "__main__":

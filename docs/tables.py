@@ -38,7 +38,8 @@ WORDS = MEASURES | {"wall_seconds": "seconds a turnover", "core_seconds": "core 
                     "break_even_simulation": "cheaper than the direct simulation after (T)",
                     "break_even_grid": "cheaper than the best grid after (T)", "time_step": "step",
                     "step_integrator": "integrator", "step_size": "step", "step_seconds": "search (s)",
-                    "step_error_twice": "error with twice the step", "step_error": "error", "step_error_half": "with half"}
+                    "step_error_twice": "error with twice the step", "step_error": "error",
+                    "step_error_half": "with half"}
 FLOOR, SIMULATION = "floor", "simulation"
 
 
@@ -74,8 +75,8 @@ def numbers(run: str, rows: str) -> str:
 
 
 def number(row: Mapping[str, Any], key: str) -> str:
-    """Two digits, or as many as the standard deviation tells where there is one; ratios to three digits after the
-    point; steps to three digits and their errors, which hardly differ, to four; a word as it is; nothing without a number."""
+    """Two digits, or as many as the standard deviation determines; ratios to three digits after the point; steps to
+    three digits and their errors to four; a word as it is; empty without a number."""
     value, spread = row.get(key), row.get(f"{key}_spread")
     if value is None or isinstance(value, str):
         return value or ""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from eddies.analysis.against_truth import InvariantStatistics
-from eddies.analysis.rollout import Pair
+from eddies.analysis.rollout import Plane
 from eddies.analysis.velocity_gradients import ConditionalVelocity, Invariants
 from eddies.report.figures import png
 from eddies.report.rollout_figures import invariant_plane, velocity_planes
@@ -26,8 +26,8 @@ def test_invariants_of_few_particles_are_drawn(particles):
 
 @pytest.mark.parametrize("frames", [1, 2, 4])
 def test_planes_are_as_large_with_few_frames(frames):
-    plane = np.random.default_rng(2).normal(size=(8, 8))
-    figure = velocity_planes([Pair(0.1 * number, plane, plane) for number in range(frames)], 1.0)
+    plane = Plane(np.random.default_rng(2).normal(size=(3, 8, 8)), np.zeros((8, 8)))
+    figure = velocity_planes({"true tracers": [plane] * frames, "model": [plane] * frames}, 0.1 * np.arange(frames))
     png(figure)
     width = figure.axes[0].get_position().width * figure.get_figwidth()
     assert width == pytest.approx(2.05, abs=0.06)

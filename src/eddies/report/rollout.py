@@ -8,7 +8,7 @@ from eddies.analysis import against_truth, disorder
 from eddies.analysis.errors import normalized_l2
 from eddies.analysis.lagrangian import differences, of_both
 from eddies.analysis.pdfs import kl_divergence
-from eddies.analysis.rollout import PLANES, Pair, Rollout
+from eddies.analysis.rollout import PLANES, Rollout
 from eddies.measures import MEASURES
 from eddies.report import rollout_figures
 from eddies.report.page import Metric, Section
@@ -115,23 +115,23 @@ def _notices(run: Rollout, last: float) -> list[str]:
 
 
 def _add_planes(shown: Section, run: Rollout, main: bool) -> None:
-    both = [(float(run.common.times[index]), *run.both(run.planes, index)) for index in run.common.spread(PLANES)]
-    planes = [Pair(time, model.velocity[0], truth.velocity[0]) for time, model, truth in both]
+    shown_at = run.common.spread(PLANES)
+    times = run.common.times[list(shown_at)] / run.turnover
+    models, truths = zip(*(run.both(run.planes, index) for index in shown_at))
+    model, truth = models[-1], truths[-1]
     shown.add_figure(
         "figure-4-velocity", "Velocity over time (the paper's Fig. 4)",
-        rollout_figures.velocity_planes(planes, run.turnover),
+        rollout_figures.velocity_planes({"true tracers": truths, "model": models}, times),
         f"u_x in the plane z = π. Top: true tracers; bottom: model; both from {run.reconstructed_by}. "
-        f"Relative difference in the last plane: {normalized_l2(planes[-1].model, planes[-1].truth):.3f}.")
+        f"Relative difference in the last plane: {normalized_l2(model.velocity[0], truth.velocity[0]):.3f}.")
     if not main:
         return
-    time, model, truth = both[-1]
-    rotation = Pair(time, model.vorticity, truth.vorticity)
-    energy = Pair(time, *(np.sum(each.velocity**2, axis=0) / 2 for each in (model, truth)))
-    ratios = [pair.model.mean() / pair.truth.mean() for pair in (rotation, energy)]
+    ratios = [quantity(model).mean() / quantity(truth).mean() for quantity in (
+        lambda plane: plane.vorticity, rollout_figures.kinetic_energy)]
     shown.add_figure(
         "figure-5-vorticity-energy", "Vorticity and kinetic energy (the paper's Fig. 5)",
-        rollout_figures.vorticity_and_energy(rotation, energy),
-        f"Plane z = π at t = {time / run.turnover:.2f} T, both from {run.reconstructed_by}. Mean over the plane, "
+        rollout_figures.vorticity_and_energy({"true tracers": truth, "model": model}),
+        f"Plane z = π at t = {times[-1]:.2f} T, both from {run.reconstructed_by}. Mean over the plane, "
         f"model / truth: vorticity {ratios[0]:.2f}, energy {ratios[1]:.2f}.")
 
 

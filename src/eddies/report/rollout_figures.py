@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from eddies.analysis import disorder
 from eddies.analysis.against_truth import EDGES, InvariantStatistics, pdf_divergence
 from eddies.analysis.lagrangian import PathStatistics
-from eddies.analysis.rollout import Pair, SpectraAt
+from eddies.analysis.rollout import Pair, Plane, SpectraAt
 from eddies.analysis.velocity_gradients import ConditionalVelocity, vieillefosse_line
 from eddies.report.figures import (BAR, DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SIGNED, TRUTH, colour_bar,
                                    draw_pdfs, guide_power_law, largest, legend_at_foot, letter, note,
@@ -22,39 +22,51 @@ LINES = {"truth": {"label": "true tracers", "color": TRUTH},
 
 
 @styled
-def velocity_planes(pairs: Sequence[Pair], turnover: float) -> Figure:
-    """Draw u_x in planes [y, x] over time, truth above and model below, with one colour scale."""
-    figure, axes = panels(2, len(pairs), ((2.3 * len(pairs) + 1.46) / len(pairs), 2.675), right=BAR, sharex=True,
+def velocity_planes(rows: Mapping[str, Sequence[Plane]], times: Sequence[float]) -> Figure:
+    """Draw u_x in planes [y, x], a row for each name and a column for each time in turnovers.
+
+    The planes of the first row determine the colour scale.
+    """
+    high, wide = len(rows), len(times)
+    figure, axes = panels(high, wide, ((2.3 * wide + 1.46) / wide, (2.1 * high + 1.15) / high), right=BAR, sharex=True,
                           sharey=True)
-    limit = largest(*(pair.truth for pair in pairs))
-    for column, pair in zip(axes.T, pairs):
-        image = show_plane(column[0], pair.truth, (-limit, limit), SIGNED)
-        show_plane(column[1], pair.model, (-limit, limit), SIGNED)
-        column[0].set_title(f"$t = {pair.time / turnover:.2f}\\,T$")
-        column[1].set_xlabel("$x$")
-    axes[0, 0].set_ylabel("true tracers\n$y$")
-    axes[1, 0].set_ylabel("model\n$y$")
+    limit = largest(*(plane.velocity[0] for plane in next(iter(rows.values()))))
+    for row, (name, planes) in zip(axes, rows.items()):
+        for axis, plane in zip(row, planes):
+            image = show_plane(axis, plane.velocity[0], (-limit, limit), SIGNED)
+        row[0].set_ylabel(f"{name}\n$y$")
+    for first, last, time in zip(axes[0], axes[-1], times):
+        first.set_title(f"$t = {time:.2f}\\,T$")
+        last.set_xlabel("$x$")
     colour_bar(figure, image, axes.flat, "$u_x$")
     letter(axes.flat)
     return figure
 
 
 @styled
-def vorticity_and_energy(vorticity: Pair, energy: Pair) -> Figure:
-    """Draw planes [y, x] of vorticity magnitude and kinetic energy, truth and model, with one colour scale a row."""
-    figure, axes = panels(2, 2, (3.65, 3.295), right=BAR, sharex=True, sharey=True)
-    for row, pair, label in zip(axes, (vorticity, energy), (r"$|\omega|$", r"$\frac{1}{2}|u|^2$")):
-        limit = largest(pair.truth)
-        image = show_plane(row[0], pair.truth, (0, limit), POSITIVE)
-        show_plane(row[1], pair.model, (0, limit), POSITIVE)
+def vorticity_and_energy(planes: Mapping[str, Plane]) -> Figure:
+    """Draw planes [y, x] of vorticity magnitude and kinetic energy, a column for each name.
+
+    The first plane of a row determines its colour scale.
+    """
+    figure, axes = panels(2, len(planes), (2.6 + 2.1 / len(planes), 3.295), right=BAR, sharex=True, sharey=True)
+    for row, quantity, label in zip(axes, (lambda plane: plane.vorticity, kinetic_energy),
+                                    (r"$|\omega|$", r"$\frac{1}{2}|u|^2$")):
+        shown = [quantity(plane) for plane in planes.values()]
+        for axis, values in zip(row, shown):
+            image = show_plane(axis, values, (0, largest(shown[0])), POSITIVE)
         colour_bar(figure, image, row, label, extend="max")
         row[0].set_ylabel("$y$")
-    for axis, name in zip(axes[0], ("true tracers", "model")):
-        axis.set_title(name)
-    for axis in axes[1]:
-        axis.set_xlabel("$x$")
+    for first, last, name in zip(*axes, planes):
+        first.set_title(name)
+        last.set_xlabel("$x$")
     letter(axes.flat)
     return figure
+
+
+def kinetic_energy(plane: Plane) -> np.ndarray:
+    """|u|^2 / 2 in a plane [y, x]."""
+    return np.sum(plane.velocity**2, axis=0) / 2
 
 
 @styled
