@@ -16,5 +16,5 @@ def one_model(name: str, overrides: Sequence[str] = (), removals: Sequence[str] 
 
 def problems_of(scene: Scene, comm) -> tuple[list[str], list[str]]:
     """Refusals and warnings of all stages of a scene."""
-    from eddies.workflows.problems import here, problems
-    return problems(scene, here(scene.stages_of_all, scene.directory, comm))
+    from eddies.workflows.problems import context_here, problems
+    return problems(scene, context_here(scene.stages_of_all, scene.directory, comm))

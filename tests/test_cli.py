@@ -343,10 +343,10 @@ def test_a_command_that_would_replace_work_ends_no_other_job(comm, tmp_path, cap
     from eddies.io.run_lock import lock_directory
     assert run_cli("dns", *ABC, "--output", tmp_path) == 0
     comm.Barrier()
-    with lock_directory(comm, tmp_path) as loss:
+    with lock_directory(comm, tmp_path) as lock_lost:
         assert run_cli("dns", *ABC, "--output", tmp_path, "--set", "flow.viscosity=0.2", "--take-over") == 2
         assert comm.rank > 0 or "would be replaced: ground_truth.h5" in capfd.readouterr().err
-        assert loss() is None
+        assert lock_lost() is None
 
 
 @pytest.mark.mpi(1)

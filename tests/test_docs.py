@@ -19,7 +19,7 @@ from eddies.scene.integrators import SCHEMES
 from eddies.scene.model import Model, settings_class
 from eddies.scene.rules import quoted
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError, Tracers, builtin_scenes, load_scene
-from eddies.scene.sections import METHODS, OF_A_SET, Simulation
+from eddies.scene.sections import METHODS, SET_KEYS, Simulation
 from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS
 
 CHECKOUT = Path(__file__).parents[1]
@@ -215,7 +215,7 @@ def scene_reference():
                 lines += term_rows()
             if kind is Tracers:
                 lines.append("| **`[tracers.NAME]`**, optional | | | *A set of tracers; keys: "
-                             f"{', '.join(OF_A_SET)}.* |")
+                             f"{', '.join(SET_KEYS)}.* |")
     return "\n".join(lines)
 
 

@@ -58,7 +58,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
         SceneError: a file STOP is present at the start, or the scene lacks a section, cannot use as many ranks, makes
             too large a file for rank 0 to write, or differs from the scene of an input.
         RunInUse, RunTakenOver: another job works in the directory, or has taken it over.
-        WorkAtStake: work of other settings would be replaced.
+        WouldReplaceWork: work of other settings would be replaced.
         WriteError: the directory cannot be written.
         ProductError: an input is missing that `stages` do not make.
         VariantsFailed: variants failed; the products of the others are complete.
@@ -84,7 +84,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
         raise SceneError(problem)
     if take_over:
         for step in planned:
-            look_at_work(step, comm, overwrite)  # a command that is refused must not end another job
+            checked_work(step, comm, overwrite)  # a command that is refused must not end another job
     else:
         refuse_if_held(comm, directory)
     made = {file for step in planned for file in step.files}
@@ -94,7 +94,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
         raise SceneError(f"{directory / 'STOP'}: asks the job to stop before it begins; remove the file to continue")
     with working_in(comm, directory, stop, take_over):
         for step in planned:
-            look_at_work(step, comm, overwrite)
+            checked_work(step, comm, overwrite)
         prepare_directory(scene.to_toml(), comm, directory)
         for warning in warnings if comm.rank == 0 else ():
             log.warning(warning)
@@ -143,7 +143,7 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
     scene, directory = step.scene, step.directory
     if step.links:  # the other inputs were checked before the first step
         check_inputs(step, comm)
-    work = look_at_work(step, comm, overwrite)
+    work = checked_work(step, comm, overwrite)
     if has_single_writer(comm):
         log.info("rank 0 writes all files, each at most %s, because this h5py has no MPI", in_units(LARGEST_BYTES))
     if scene.foreign:
@@ -151,7 +151,7 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
     checked = False  # whether the ground truth was checked for the stages that need it
     for number, name in enumerate(step.stages):
         stage = STAGES[name]
-        if name in work.useless and stage.checkpoints is not None:
+        if name in work.obsolete and stage.checkpoints is not None:
             CheckpointDirectory(comm, directory / stage.checkpoints, "").remove()
         if name in work.done:
             log.info("%s: skipped, %s is complete and made with the same settings", name, stage.file)
@@ -165,8 +165,8 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
         run_stage(name, (scene, comm, directory, stop), comm, directory, stop, name in work.begun)
 
 
-def look_at_work(step: Step, comm: Comm, overwrite: bool) -> Work:
-    """Examine the directory of a step. Raises WorkAtStake if work would be replaced without `overwrite`."""
+def checked_work(step: Step, comm: Comm, overwrite: bool) -> Work:
+    """Examine the directory of a step. Raises WouldReplaceWork if work would be replaced without `overwrite`."""
     work = in_files(comm, step.directory, lambda: find_work(
         [*step.links, *step.stages], step.scene, step.directory, step.links))
     if not overwrite:
@@ -177,7 +177,7 @@ def look_at_work(step: Step, comm: Comm, overwrite: bool) -> Work:
 @contextmanager
 def working_in(comm: Comm, directory: Path, stop: StopRequest, take_over: bool) -> Iterator[None]:
     """Hold the lock of a directory. If another job takes it over, the next call of `stop` ends this job."""
-    with lock_directory(comm, directory, take_over) as loss, stop.watching(loss):
+    with lock_directory(comm, directory, take_over) as lock_lost, stop.watching(lock_lost):
         yield
 
 

@@ -67,7 +67,7 @@ class StoredRun:
         """A group that is computed from the rollout, frame by frame."""
         from mpi4py import MPI
 
-        from eddies.io.datasets import MadeArray, made_group
+        from eddies.io.datasets import ComputedArray, computed_group
         from eddies.workflows.rollout.measured import open_rollout
 
         def make(column: str, frames: Sequence[int]) -> list[np.ndarray]:
@@ -80,16 +80,16 @@ class StoredRun:
                                 "fields and gradients")
             times = measured.groups[group].times
             samples = {column: measured.groups[group].read(0, column) for column in measured.groups[group].columns}
-        arrays = {"time": MadeArray.of(f"{group}/time", times)}
+        arrays = {"time": ComputedArray.of(f"{group}/time", times)}
         size = np.arange(len(next(iter(samples.values()))))
         if group.startswith("spectra"):
-            arrays["wavenumber"] = MadeArray.of(f"{group}/wavenumber", size)
+            arrays["wavenumber"] = ComputedArray.of(f"{group}/wavenumber", size)
         elif not group.startswith("fields"):
-            arrays["id"] = MadeArray.of("particles/truth/id", size)
+            arrays["id"] = ComputedArray.of("particles/truth/id", size)
         for column, sample in samples.items():
             place = f"{group}/{column}" + "/value" * group.startswith("particles")
-            arrays[column] = MadeArray(place, (len(times), *sample.shape), sample.dtype, partial(make, column))
-        return made_group(arrays)
+            arrays[column] = ComputedArray(place, (len(times), *sample.shape), sample.dtype, partial(make, column))
+        return computed_group(arrays)
 
     @cached_property
     def scene(self) -> Scene:

@@ -22,9 +22,9 @@ from eddies.report.figures import DNS, FILTERED, FOURTH, MODEL, SECOND, THIRD, T
 
 DRAWN = ("velocity_error_half", "acceleration_kl")
 # Label, colour and marker of the variants.
-LOOKS = {"resolved": ("the resolved velocity", MODEL, "o"), "grid": ("best grid of its cost", TRUTH, "s"),
-         "paper": ("the published form", THIRD, "D"), "transport-velocity": ("transport-velocity SPH", FOURTH, "v"),
-         "local": ("only neighbours", SECOND, "P"), "no-force": ("no force", DNS, "x")}
+MARKERS = {"resolved": ("the resolved velocity", MODEL, "o"), "grid": ("best grid of its cost", TRUTH, "s"),
+           "paper": ("the published form", THIRD, "D"), "transport-velocity": ("transport-velocity SPH", FOURTH, "v"),
+           "local": ("only neighbours", SECOND, "P"), "no-force": ("no force", DNS, "x")}
 
 Row = Mapping[str, Any]
 
@@ -62,7 +62,7 @@ def drawn(results: Sequence[Mapping[str, Any]]) -> Figure:
     figure, axes = panels(1, len(DRAWN), (5.4, 4.2))
     figure.set_layout_engine("constrained")  # for labels and legends that are wide
     for axis, measure in zip(axes.flat, DRAWN):
-        for name, (words, colour, marker) in LOOKS.items():
+        for name, (words, colour, marker) in MARKERS.items():
             width, error, spread, _ = zip(*points(results, name, measure))
             axis.errorbar(width, error, [[min(s, 0.9 * e) for s, e in zip(spread, error)], spread], color=colour,
                           marker=marker, markersize=6, capsize=2, elinewidth=1, label=words)

@@ -52,7 +52,7 @@ ETA = 1.5
 PARTS = {
     "transforms": [(SpectralGrid, name) for name in ("forward", "backward", "squares")],
     "splines": [(Points, "at"), (Points, "spread"), (SplineInterpolation, "with_ghosts")],
-    "vectors": [(ModePasses, name) for name in ("image", "descend", "turn")],
+    "vectors": [(ModePasses, name) for name in ("apply", "descend", "update_direction")],
     "solve, the rest": [(LeastSquares, "solve")],
     "closure, the rest": [(ResolvedVelocity, "of"), (ResolvedVelocity, "remember")],
     "pairs": [(Context, "sum_pairs"), (Neighborhood, "update")],

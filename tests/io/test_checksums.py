@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from eddies.io import checksums
-from eddies.io.checksums import ATTRIBUTE, BLOCK_BYTES, PIECE, find_damage, known_sums
+from eddies.io.checksums import ATTRIBUTE, BLOCK_BYTES, PIECE, find_damage, table_checksum
 from eddies.io.errors import ProductError
 from eddies.io.hdf5 import (append_frame, create_product, growing_dataset, open_product, read_frame, read_table,
                             write_table)
@@ -151,7 +151,7 @@ def test_every_changed_byte_is_found(comm, path):
 
 @pytest.mark.mpi(1)
 def test_another_or_a_missing_file_is_found(comm, path, tmp_path):
-    known = known_sums(path)
+    known = table_checksum(path)
     assert find_damage(comm, path, known) is None
     assert "is not the file that was written" in find_damage(comm, path, known + 1)
     assert "nowhere.h5: missing" in find_damage(comm, tmp_path / "nowhere.h5")

@@ -13,7 +13,7 @@ import pytest
 
 from eddies.errors import UserError
 from eddies.io import new_files
-from eddies.io.checksums import FOOTER, find_damage, known_sums, open_to_read
+from eddies.io.checksums import FOOTER, find_damage, open_to_read, table_checksum
 from eddies.io.errors import WriteError, write_error
 from eddies.io.fields import FieldWriter
 from eddies.io.hdf5 import (append_frame, create_product, growing_dataset, in_files, open_product, write_array,
@@ -204,7 +204,7 @@ def test_a_file_that_was_left_open_does_not_harm_the_next_one(tmp_path):
                            text=True, timeout=50)
     assert ended.stdout == "made\n", ended.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["kernel.h5"]
-    assert known_sums(tmp_path / "kernel.h5") is not None
+    assert table_checksum(tmp_path / "kernel.h5") is not None
     with open_to_read(tmp_path / "kernel.h5") as file:  # compares with the checksums
         assert np.all(file["values"][:] == 2.0)
 

@@ -6,7 +6,7 @@ import h5py
 import pytest
 
 from eddies.io.hdf5 import create_product, growing_dataset, write_table
-from eddies.io.quantities import words_on
+from eddies.io.quantities import dataset_attributes
 
 
 @pytest.mark.mpi(1)
@@ -36,7 +36,7 @@ def dimensions(*paths):
     powers = Counter()
     for path in paths:
         path, _, power = path.partition("^")
-        for place, part in enumerate(words_on("ground_truth", path)["units"].split("/")):
+        for place, part in enumerate(dataset_attributes("ground_truth", path)["units"].split("/")):
             name, _, own = part.partition("^")
             powers[name] += (-1 if place else 1) * int(own or 1) * int(power or 1)
     return {name: power for name, power in powers.items() if name != "1" and power}

@@ -47,10 +47,10 @@ def quick(monkeypatch):
 
 @pytest.mark.mpi(1, 2)
 def test_a_job_holds_its_directory_and_leaves_nothing(comm, tmp_path):
-    with lock_directory(comm, tmp_path / "a/run") as loss:
+    with lock_directory(comm, tmp_path / "a/run") as lock_lost:
         comm.Barrier()
         known = json.loads((tmp_path / "a/run/LOCK").read_text())
-        assert known["host"] and known["start"] and loss() is None
+        assert known["host"] and known["start"] and lock_lost() is None
         with pytest.raises(RunInUse, match=rf"run: another job works here \(process {known['pid']} on .*--take-over"):
             refuse_if_held(comm, tmp_path / "a/run")
         with pytest.raises(RunInUse), lock_directory(comm, tmp_path / "a/run"):
@@ -141,7 +141,7 @@ def test_an_unreadable_lock_holds_while_it_is_new(comm, tmp_path):
 def test_a_job_that_lost_its_directory_ends_and_touches_nothing(comm, tmp_path):
     stop, partial = StopRequest(comm), tmp_path / "kernel.h5.partial"
     with pytest.raises(RunTakenOver, match=r"another job has taken over this run directory \(process"):
-        with lock_directory(comm, tmp_path) as loss, stop.watching(loss):
+        with lock_directory(comm, tmp_path) as lock_lost, stop.watching(lock_lost):
             assert not stop()
             with create_product(comm, tmp_path / "kernel.h5", "kernel", {}):
                 with lock_directory(comm, tmp_path, take_over=True):
@@ -157,13 +157,13 @@ def test_a_job_that_lost_its_directory_ends_and_touches_nothing(comm, tmp_path):
 @pytest.mark.mpi(1)
 @pytest.mark.usefixtures("quick")
 def test_a_job_that_slept_while_another_came_and_went_has_lost_its_directory(comm, tmp_path, monkeypatch):
-    with lock_directory(comm, tmp_path) as loss:
+    with lock_directory(comm, tmp_path) as lock_lost:
         with monkeypatch.context() as patch:
             patch.setattr(run_lock, "find_lock", failing(OSError))
-            assert loss() is None  # a file system that hangs
+            assert lock_lost() is None  # a file system that hangs
         with lock_directory(comm, tmp_path, take_over=True):
             pass
-        assert isinstance(loss(), RunTakenOver)
+        assert isinstance(lock_lost(), RunTakenOver)
         with pytest.raises(RunTakenOver, match="kernel.h5: another job has taken"):
             with create_product(comm, tmp_path / "kernel.h5", "kernel", {}):
                 (tmp_path / "kernel.h5.partial").unlink()  # as the other job has

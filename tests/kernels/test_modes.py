@@ -5,7 +5,7 @@ import pytest
 
 from eddies.kernels.modes import ModePasses
 
-VECTORS = ("given", "modes", "direction", "image", "solution", "residual")
+VECTORS = ("given", "modes", "direction", "applied", "solution", "residual")
 
 
 def set_up(library, shape, kind=np.float64):
@@ -23,9 +23,9 @@ def set_up(library, shape, kind=np.float64):
 def run(passes, inverse, vectors):
     """All passes on copies of the vectors: the inner products, and the results by name."""
     own = {name: vector.copy() for name, vector in vectors.items()}
-    made, product = passes.image(own["given"], own["modes"])
-    square = passes.descend(0.7, inverse, own["direction"], own["image"], own["solution"], own["residual"])
-    passes.turn(-0.3, inverse, own["residual"], own["direction"])
+    made, product = passes.apply(own["given"], own["modes"])
+    square = passes.descend(0.7, inverse, own["direction"], own["applied"], own["solution"], own["residual"])
+    passes.update_direction(-0.3, inverse, own["residual"], own["direction"])
     return (product, square), {"made": made, **{name: own[name] for name in ("direction", "solution", "residual")}}
 
 
@@ -39,7 +39,7 @@ def test_one_iteration(library, close, shape, kind, of_sums, of_modes):
     scaled = scale * exact["given"]
     along = sum(k * u for k, u in zip(wavevector, scaled)) * inverse_squared
     made = scaled - np.stack([k * along for k in wavevector]) + penalty * exact["modes"]
-    residual = exact["residual"] - 0.7 * exact["image"]
+    residual = exact["residual"] - 0.7 * exact["applied"]
     expected = {"made": made, "solution": exact["solution"] + 0.7 * exact["direction"], "residual": residual,
                 "direction": inverse * residual - 0.3 * exact["direction"]}
     for name, vector in expected.items():

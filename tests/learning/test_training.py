@@ -92,7 +92,7 @@ def test_each_phase_ends_with_its_best_state(comm):
 @pytest.mark.mpi(1)
 def test_a_phase_ends_with_its_patience(comm):
     """The first phase has its least error after two steps, the second at its end."""
-    training = training_of(comm, lambda: abs(training.optimizer.taken - 2) if training.number == 0 else
+    training = training_of(comm, lambda: abs(training.optimizer.taken - 2) if training.phase_number == 0 else
                            10.0 - training.optimizer.taken, steps=(12, 8), patience=4)
     assert np.bincount(finished(training).columns()["phase"].astype(int)).tolist() == [6, 8]
 

@@ -29,8 +29,8 @@ def test_the_result_solves_the_equations(comm):
     assert 5 < found.iterations < 100 and found.left <= 1e-24 * size
     at_points = equations.grid.at(found.modes, points)
     torch.testing.assert_close(found.at_points, at_points, rtol=0, atol=1e-12 * float(at_points.abs().max()))
-    image = equations.gathered(at_points, points) + equations.penalty * found.modes
-    assert equations.size(right - image, count) <= 1e-22 * size
+    applied = equations.gathered(at_points, points) + equations.penalty * found.modes
+    assert equations.size(right - applied, count) <= 1e-22 * size
     # Without a gradient the descent takes one pass of the library.
     with torch.no_grad():
         descent = equations.descent(values, points, found.modes)
@@ -38,5 +38,5 @@ def test_the_result_solves_the_equations(comm):
     torch.testing.assert_close(descent, recorded, rtol=0, atol=1e-13 * float(right.abs().max()))
     # With a given number of iterations the remaining residual is reported.
     found = equations.solve(points, right, count, 0.0, 3, 100)
-    image = equations.gathered(equations.grid.at(found.modes, points), points) + equations.penalty * found.modes
-    assert found.iterations == 3 and equations.size(right - image, count) == pytest.approx(found.left, rel=1e-9)
+    applied = equations.gathered(equations.grid.at(found.modes, points), points) + equations.penalty * found.modes
+    assert found.iterations == 3 and equations.size(right - applied, count) == pytest.approx(found.left, rel=1e-9)

@@ -155,8 +155,8 @@ def test_the_seen_fraction_is_that_of_truths_for_training(tmp_path):
 
 def test_forcing_while_tracers_are_followed():
     scene = load_scene(TINY, ["tracers.forced=true"])
-    assert scene.injects and not load_scene(TINY).injects
-    assert not load_scene(TINY, ["tracers.forced=true", "simulation.injection=none"]).injects
+    assert scene.rollout_is_forced and not load_scene(TINY).rollout_is_forced
+    assert not load_scene(TINY, ["tracers.forced=true", "simulation.injection=none"]).rollout_is_forced
     replace(scene, spin_up=None)
     with pytest.raises(SceneError, match=r"\[tracers\] forced = true: needs a section \[forcing\]"):
         replace(scene, forcing=None)

@@ -1,17 +1,19 @@
 """Fields from tracks of a simulated flow beside the true fields: methods, noise, lost tracks, a volume. A script.
 
-    mpirun -n 2 .venv/bin/eddies dns tests/validation/tracks.toml [--set seed=2 --output runs/tracks-2]
-    mpirun -n 2 .venv/bin/python tests/validation/twin_tracks.py runs/tracks [runs/tracks-2 ...]
+    mpirun -n 2 .venv/bin/eddies dns tests/validation/tracks.toml [--set seed=3 --output runs/tracks-3]
+    mpirun -n 2 .venv/bin/python tests/validation/twin_tracks.py runs/tracks [runs/tracks-3 ...]
 
 Writes the tracks of each case as a user would have them, reconstructs them, and compares the fields, after the filter
-of the stored ones, with these. Prints means over the runs, at all times after the first t_eta, and the standard
-deviations of several runs, and writes docs/results/tracks.json.
+of the stored ones, with these. Then forecasts the flow from the first field: the model `resolved` with weights of
+another flow of `hit`, and grids that start from the particles. Prints means over the runs, of fields at all times after
+the first t_eta, and the standard deviations of several runs, and writes docs/results/tracks.json.
 """
 
 import json
 import sys
 import tempfile
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,6 +54,27 @@ CASES = [
     *(Case("whole-32", method, inner=0.5) for method in ("least-squares", "memory"))]
 
 
+# A scene that forecasts tracks over half a turnover: its frames are seven eighths of t_eta apart, or less.
+FORECAST = """
+[model]
+preset = "resolved"
+path = "{weights}"
+[simulation]
+start = 0.0
+turnovers = 0.55
+frame_interval = {interval}
+[variant.resolved]
+"""
+GRID = """
+[variant.grid-{cells}]
+simulation.method = "eulerian"
+eulerian.cells = {cells}
+eulerian.start = "particles"
+"""
+WEIGHTS = {"filtered-16": "eddies:hit-coarse", "filtered-32": "eddies:hit"}
+COLUMNS = "velocity_error_early", "velocity_error_half", "wall_seconds"
+
+
 def write(case: Case, truth: h5py.File, path: Path, seed: int) -> str:
     """Write the tracks of a case; returns the lines of [tracks]."""
     holder, reference = truth["particles/tracers"], truth["reference"].attrs
@@ -80,7 +103,10 @@ def write(case: Case, truth: h5py.File, path: Path, seed: int) -> str:
 
 
 def errors_of(case: Case, directory: Path, truth: h5py.File) -> dict[str, np.ndarray]:
-    """Errors of filtered velocity and gradient over the frames whose fields are stored, and the estimate."""
+    """Errors of filtered velocity, gradient and pressure over the frames whose fields are stored, and the estimate.
+
+    The true pressure over the density is that of the density, c^2 (rho - <rho>) / <rho>: these flows have no sound.
+    """
     reference = truth["reference"].attrs
     found: dict[str, list[float]] = defaultdict(list)
     with h5py.File(directory / "reconstruction.h5") as file:
@@ -88,7 +114,8 @@ def errors_of(case: Case, directory: Path, truth: h5py.File) -> dict[str, np.nda
         corner, fields = file["about"].attrs["corner"], file["fields/reconstructed"]
         times, cells = fields["time"][()], fields.attrs["cells"]
         width = 0.0 if case.tracks[0] == "f" else float(reference["filter_width"])
-        for time, exact in zip(truth["fields/filtered/time"][()], truth["fields/filtered/velocity"]):
+        filtered = truth["fields/filtered"]
+        for time, exact, density in zip(filtered["time"][()], filtered["velocity"], filtered["density"]):
             frame = int(np.argmin(np.abs(times - time)))
             if abs(times[frame] - time) > 1e-6 or time < float(reference["kolmogorov_time"]):
                 continue
@@ -96,8 +123,12 @@ def errors_of(case: Case, directory: Path, truth: h5py.File) -> dict[str, np.nda
             inside = np.flatnonzero(np.abs(axis - np.pi) <= case.inner * BOX / 2 * (1 if case.inner == 1 else 0.9))
             own = at_points(fields["velocity"][frame], edge, axis[inside] + corner[0], width)
             true = at_points(exact, BOX, axis[inside], 0.0)
-            for name, pair in zip(("velocity", "gradient"), zip(own, true)):
-                found[f"{name}_error"].append(np.linalg.norm(pair[0] - pair[1]) / np.linalg.norm(pair[1]))
+            pressure = at_points(fields["pressure"][frame], edge, axis[inside] + corner[0], width)[0]
+            by_density = at_points(density, BOX, axis[inside], 0.0)[0] * float(reference["sound_speed"]) ** 2
+            pairs = {"velocity": (own[0], true[0]), "gradient": (own[1], true[1]),
+                     "pressure": (pressure - pressure.mean(), by_density - by_density.mean())}
+            for name, (mine, exact_one) in pairs.items():
+                found[f"{name}_error"].append(np.linalg.norm(mine - exact_one) / np.linalg.norm(exact_one))
         table = file["errors_over_time"]
         late = table["time"][()] > float(reference["kolmogorov_time"])
         found["validation_error"] = list(table["validation_error"][late])
@@ -106,7 +137,7 @@ def errors_of(case: Case, directory: Path, truth: h5py.File) -> dict[str, np.nda
 
 
 def at_points(field: np.ndarray, edge: float, places: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """A field (3, z, y, x) on a periodic cube and its gradient at the points of a grid, after a Gaussian filter."""
+    """A field (components, z, y, x) on a periodic cube and its gradient at the points of a grid, after a Gaussian filter."""
     cells = field.shape[1]
     number = np.fft.fftfreq(cells, 1 / cells) * (np.abs(np.fft.fftfreq(cells, 1 / cells)) < cells / 2)
     k = 2 * np.pi / edge * number
@@ -120,33 +151,59 @@ def at_points(field: np.ndarray, edge: float, places: np.ndarray, width: float) 
     return values(modes), np.stack([values(modes * 1j * along) for along in (k, k[:, None], k[:, None, None])], 1)
 
 
-def main(runs: list[Path]) -> None:
-    """Run all cases on all flows."""
-    comm, rows = MPI.COMM_WORLD, []
-    for case in CASES:
-        found = defaultdict(list)
-        for seed, run in enumerate(runs):
-            path = Path(comm.bcast(tempfile.mkdtemp() if comm.rank == 0 else None))
-            with h5py.File(run / case.tracks / "ground_truth.h5") as truth:
-                if comm.rank == 0:
-                    lines = write(case, truth, path / "tracks.h5", seed)
-                    cells = truth["fields/filtered"].attrs["cells"]
-                    (path / "scene.toml").write_text(
-                        f'[tracks]\n{lines}\n[reconstruction]\nmethod = "{case.method}"\ncells = {2 * cells}\n'
-                        'fields = ["velocity"]\n')
-                comm.Barrier()
-                eddies.run(path / "scene.toml", stages=["dns", "reconstruct"], output=path / "run", comm=comm)
-                if comm.rank == 0:
-                    for name, values in errors_of(case, path / "run", truth).items():
-                        found[name].append(values.mean())
-        if comm.rank == 0:
-            means = {name: float(np.mean(values)) for name, values in found.items()}
-            spreads = {f"{name}_spread": float(np.std(values, ddof=1)) for name, values in found.items()
-                       if len(runs) > 1}
-            rows.append({**case.__dict__, **means, **spreads})
-            print(rows[-1], flush=True)
+def made(case: Case, run: Path, seed: int, rest: str, stages: Sequence[str] | None = None) -> Path:
+    """Run stages of a scene of the tracks of a case, with the sections `rest`; returns its directory. Collective."""
+    comm = MPI.COMM_WORLD
+    path = Path(comm.bcast(tempfile.mkdtemp() if comm.rank == 0 else None))
     if comm.rank == 0:
-        HERE.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        with h5py.File(run / case.tracks / "ground_truth.h5") as truth:
+            lines = write(case, truth, path / "tracks.h5", seed)
+        (path / "scene.toml").write_text(f"[tracks]\n{lines}\n{rest}")
+    comm.Barrier()
+    eddies.run(path / "scene.toml", stages=stages, output=path / "run", comm=comm)
+    return path / "run"
+
+
+def fields_of(case: Case, run: Path, seed: int) -> dict[str, float]:
+    """Mean errors of the reconstructed fields of a case; collective."""
+    with h5py.File(run / case.tracks / "ground_truth.h5") as truth:
+        cells = 2 * truth["fields/filtered"].attrs["cells"]
+        directory = made(case, run, seed, f'[reconstruction]\nmethod = "{case.method}"\ncells = {cells}\n'
+                         'fields = ["velocity", "pressure"]\n', ["dns", "reconstruct"])
+        return {name: values.mean() for name, values in errors_of(case, directory, truth).items()}
+
+
+def forecasts_of(tracks: str, run: Path, seed: int) -> dict[str, dict[str, float]]:
+    """Errors and seconds a turnover of the forecasts of a set of tracks, by method; collective."""
+    with h5py.File(run / tracks / "ground_truth.h5") as truth:
+        times, limit = truth["particles/tracers/position/time"][:2], float(truth["reference"].attrs["kolmogorov_time"])
+    step = float(times[1] - times[0])
+    rest = FORECAST.format(weights=WEIGHTS[tracks], interval=step * int(limit / step))
+    directory = made(Case(tracks), run, seed, rest + "".join(GRID.format(cells=cells) for cells in (32, 48)))
+    rows = json.loads((directory / "report/variants.json").read_text(encoding="utf-8"))["rows"]
+    return {row["name"]: {key: row[key] for key in COLUMNS} for row in rows}
+
+
+def combined(found: list[dict[str, float]]) -> dict[str, float]:
+    """Means, and standard deviations of several runs."""
+    values = {name: [each[name] for each in found] for name in found[0]}
+    spreads = {f"{name}_spread": float(np.std(each, ddof=1)) for name, each in values.items() if len(found) > 1}
+    return {name: float(np.mean(each)) for name, each in values.items()} | spreads
+
+
+def main(runs: list[Path]) -> None:
+    """Run all cases and forecasts on all flows."""
+    fields = [case.__dict__ | combined([fields_of(case, run, seed) for seed, run in enumerate(runs)])
+              for case in CASES]
+    forecasts = []
+    for tracks in WEIGHTS:
+        found = [forecasts_of(tracks, run, seed) for seed, run in enumerate(runs)]
+        forecasts += [{"tracks": tracks, "method": name} | combined([each[name] for each in found])
+                      for name in found[0]]
+    if MPI.COMM_WORLD.rank == 0:
+        HERE.write_text(json.dumps({"fields": fields, "forecasts": forecasts}, indent=1) + "\n", encoding="utf-8")
+        for row in [*fields, *forecasts]:
+            print(row)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from eddies.scene.model import COME_ALONG, WEIGHTS, weights_that_come_along
+from eddies.scene.model import BUILT_IN_PREFIX, WEIGHTS, built_in_weights
 from eddies.scene.scene import load_scene
 from eddies.stored_run import open_run
 from tests.left_out import leave_out_figures
@@ -80,7 +80,7 @@ def check_words(path, dataset):
 def test_what_check_foresees_is_what_was_run(run_directory):
     from eddies.workflows.foreseen.numbers import estimate, rollout_in
     from eddies.workflows.foreseen.storage import disk, rollout_bytes, trajectory_bytes
-    from eddies.workflows.ground_truth.frame_counts import whole_frames
+    from eddies.workflows.ground_truth.frame_counts import unfiltered_frames
     scene = load_scene(TINY, CHANGES)
     expected = estimate(scene)
     with h5py.File(run_directory / "rollout.h5") as file:
@@ -90,7 +90,7 @@ def test_what_check_foresees_is_what_was_run(run_directory):
     course = rollout_in(scene.simulation, rollout["eddy_turnover_time"], expected.rollout_step)
     assert (course.steps, course.evaluations) == (rollout["steps"], rollout["evaluations"]) == (9, 28)
     assert expected.mach == pytest.approx(measured, rel=0.5)
-    whole = len(whole_frames(scene.simulation, scene.training, scene.tracers.field_every, frames))
+    whole = len(unfiltered_frames(scene.simulation, scene.training, scene.tracers.field_every, frames))
     sizes = {"ground_truth": trajectory_bytes(scene.flow, scene.tracers, frames, whole),
              "rollout": rollout_bytes(scene.tracers.particles, course.intervals + 1),
              "kernel": disk(scene, "train-kernel").kept, "model": disk(scene, "train").kept}
@@ -126,9 +126,9 @@ def test_weights_that_come_along_are_as_good_as_their_card_says(run_directory, l
     """On a flow that differs only by round-off from that of the training."""
     page = (Path(__file__).parents[2] / "docs/training.md").read_text()
     card = {name: float(error) for name, error in re.findall(r"^\| `(eddies:.+?)` \|.*\| ([\d.]+) \|$", page, re.M)}
-    assert list(card) == weights_that_come_along()
+    assert list(card) == built_in_weights()
     for name, error in card.items():
-        with h5py.File(WEIGHTS / f"{name.removeprefix(COME_ALONG)}.h5") as file:
+        with h5py.File(WEIGHTS / f"{name.removeprefix(BUILT_IN_PREFIX)}.h5") as file:
             assert f"{file['a_priori/acceleration_error'][-1]:.3f}" == f"{error:.3f}", name
     linked(run_directory / "ground_truth.h5", run_directory / "kernel.h5")
     assert run_cli("train", *SCENE, "--set", "model.preset=resolved", "--set", "model.path=eddies:tiny",

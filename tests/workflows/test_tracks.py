@@ -8,7 +8,7 @@ from eddies import open_run, run, write_tracks
 from eddies.io.errors import ProductError
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import export, tracks
-from eddies.workflows.ground_truth.track_frames import measured
+from eddies.workflows.ground_truth.track_frames import read_measured
 from tests.workflows.small_rollout import prepared
 
 MILLIMETRES, MILLISECONDS = 20.0, 4.0  # edge of the box, and the time unit of the file in that of the flow
@@ -85,7 +85,7 @@ def test_noise_costs_less_with_smoothing(comm, twin, tmp_path):
     errors = {}
     for given in (0.0, noise):
         scene = scene_of(comm, tmp_path, SECTION.format(path="noisy.csv", unit=MILLISECONDS) + f"noise = {given}\n")
-        found = measured(scene.tracks)
+        found = read_measured(scene.tracks)
         velocity = np.stack([found.frame(frame, complete=True)["velocity"] for frame in range(len(found.times))])
         errors[given] = relative(velocity, true)
     assert errors[noise] < 0.2 < 0.4 * errors[0.0]
@@ -101,16 +101,16 @@ def test_times_become_equal_ones_and_a_gap_is_named(comm, tmp_path):
     given = np.where(track % 3, np.round(time, 5), time)
     write_tracks(tmp_path / "a.h5", given, track, position)
     scene = scene_of(comm, tmp_path, f'[tracks]\npath = "a.h5"\nbox = {2 * np.pi}\n')
-    found = measured(scene.tracks)
+    found = read_measured(scene.tracks)
     np.testing.assert_allclose(found.times, np.arange(7) * 0.00333333, rtol=1e-5)
     assert found.complete == 30
     np.testing.assert_allclose(found.frame(2)["velocity"], np.tile([0.1, 0.2, 0.3], (30, 1)), rtol=0.05)
     write_tracks(tmp_path / "a.h5", time[time != times[3]], track[time != times[3]], position[time != times[3]])
     with pytest.raises(SceneError, match="no track is there at time 0.11 "):
-        measured(scene.tracks)
+        read_measured(scene.tracks)
     write_tracks(tmp_path / "a.h5", time + 1e-3 * (time == times[2]), track, position)
     with pytest.raises(SceneError, match="equal intervals are needed"):
-        measured(scene.tracks)
+        read_measured(scene.tracks)
 
 
 @pytest.mark.mpi(1)
@@ -298,8 +298,8 @@ particles = true
 def test_a_volume_has_no_images(comm, tmp_path):
     """A particle that moves by more than half of the cube, to and fro: x = 0.1 + 0.7 (2 t - t^2) at t = 0, 1, 2."""
     write_tracks(tmp_path / "a.h5", [0, 1, 2], [0, 0, 0], [[0.1, 0.5, 0.5], [0.8, 0.5, 0.5], [0.1, 0.5, 0.5]])
-    found = measured(scene_of(comm, tmp_path, '[tracks]\npath = "a.h5"\nvolume = [0, 1, 0, 1, 0, 1]\n'
-                                              'margin = 0.1\n').tracks)
+    found = read_measured(scene_of(comm, tmp_path, '[tracks]\npath = "a.h5"\nvolume = [0, 1, 0, 1, 0, 1]\n'
+                                                   'margin = 0.1\n').tracks)
     assert found.frame(0)["velocity"][0, 0] * found.unit == pytest.approx(1.4, rel=1e-3)
 
 

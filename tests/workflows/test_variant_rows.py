@@ -9,9 +9,9 @@ from eddies.io.hdf5 import create_product, write_attributes, write_table
 from eddies.io.weights import save_weights
 from eddies.measures import MEASURES
 from eddies.scene.scene import load_scene
-from eddies.workflows.variant_rows import (BEFORE, BREAK_EVEN, SEARCH, THROUGH_KERNEL, add_break_even, before, notes,
-                                           row, simulation_seconds, step_costs, together, why_not)
-from eddies.workflows.variants import Place
+from eddies.workflows.variant_rows import (BEFORE, BREAK_EVEN, SEARCH, THROUGH_KERNEL, add_break_even, before, combined,
+                                           missing_reason, notes, row, simulation_seconds, step_costs)
+from eddies.workflows.variants import RolloutRun
 from tests.small_scene import TINY
 
 HEAD = f'base = "{TINY}"\nsimulation.turnovers = 0.25\nkernel.steps = 50\n'
@@ -30,16 +30,16 @@ REALISED = {"status": "complete", "end": 1.0, "wall_seconds": 4.0, "wall_seconds
 def test_realisations_have_mean_and_spread():
     others = [REALISED | {"energy_ratio": ratio, "wall_seconds": seconds, "wall_seconds_low": seconds - 1.0}
               for ratio, seconds in ((0.7, 3.0), (0.9, 9.0))]
-    row = together([REALISED, *others])
+    row = combined([REALISED, *others])
     assert (row["realisations"], row["status"], row["qr_kl_spread"]) == (3, "complete", 0.0)
     assert row["energy_ratio"] == pytest.approx(0.7) and row["energy_ratio_spread"] == pytest.approx(0.2)
     assert (row["wall_seconds_low"], row["wall_seconds"], row["wall_seconds_high"]) == (2.0, 4.0, 5.0)
-    assert "energy_ratio_spread" not in together([REALISED])
+    assert "energy_ratio_spread" not in combined([REALISED])
 
 
 def test_one_realisation_that_stops_leaves_no_number():
     stopped = REALISED | {"status": "stopped: step 3", "stopped_at": 0.2, "energy_ratio": None}
-    row = together([REALISED, stopped])
+    row = combined([REALISED, stopped])
     assert (row["status"], row["stopped_at"], row["energy_ratio"]) == ("stopped: step 3", 0.2, None)
 
 
@@ -47,7 +47,7 @@ def test_one_realisation_that_stops_leaves_no_number():
 def test_numbers_of_another_kernel_are_left_out(tmp_path, change):
     scene = scene_of(tmp_path, ("smaller", "model.pairs.hidden = [8]", "simulation.step = 0.05"), ("own", change))
     for name, variant in scene.variant.items():
-        found = row(scene, name, [Place(variant, tmp_path)], [REALISED], None)
+        found = row(scene, name, [RolloutRun(variant, tmp_path)], [REALISED], None)
         blank = {measure for measure in MEASURES if found[measure] is None}
         assert blank == (set(THROUGH_KERNEL) if name == "own" else set())
     _, note = notes(scene)
@@ -56,9 +56,9 @@ def test_numbers_of_another_kernel_are_left_out(tmp_path, change):
 
 def test_a_variant_without_a_rollout_says_why(tmp_path):
     scene = scene_of(tmp_path)
-    assert row(scene, "plain", [Place(scene.variant["plain"], tmp_path)], [], None)["status"] == "not run"
+    assert row(scene, "plain", [RolloutRun(scene.variant["plain"], tmp_path)], [], None)["status"] == "not run"
     (tmp_path / "failure.txt").write_text("too few slabs\n")
-    assert why_not(tmp_path) == why_not(tmp_path / "realisation-2") == "failed: too few slabs"
+    assert missing_reason(tmp_path) == missing_reason(tmp_path / "realisation-2") == "failed: too few slabs"
 
 
 def test_a_turnover_costs_as_much_as_its_steps():

@@ -170,7 +170,7 @@ def test_a_variant_in_another_flow_makes_its_own_ground_truth(folder):
     shared = truths[0].read_bytes()
     (folder / "own.toml").write_text(text + "[variant.a]\n[variant.b]\nflow.viscosity = 0.2\n")
     scene = load_scene("own.toml")
-    assert [place.scene.flow.viscosity for (place,) in rollouts(scene, folder).values()] == [0.1, 0.2]
+    assert [run.scene.flow.viscosity for (run,) in rollouts(scene, folder).values()] == [0.1, 0.2]
     assert planned(scene, ("dns", "simulate"))[1] == ("runs/own/b", ("dns",), {})
     assert run_cli("dns", "own.toml") == 0
     assert run_cli("simulate", "own.toml", "--overwrite") == 0

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from eddies.analysis.lagrangian import evenly, near
+from eddies.analysis.lagrangian import evenly, neighbor_pairs
 from eddies.analysis.pdfs import bin_probabilities
 from eddies.analysis.rollout import Frames, Rollout
 
@@ -32,8 +32,8 @@ def nearest_distances(position: np.ndarray, length: float) -> np.ndarray:
     chosen = evenly(len(position), min(SAMPLED, max(PAIRS // crowd, 1)))
     nearest, missing = np.full(chosen.size, np.inf), np.arange(chosen.size)
     while missing.size and radius < 2 * length:
-        places, _, apart = near(position, length, chosen[missing], radius)
-        np.minimum.at(nearest, missing[places], apart)
+        places, _, distance = neighbor_pairs(position, length, chosen[missing], radius)
+        np.minimum.at(nearest, missing[places], distance)
         missing, radius = np.flatnonzero(np.isinf(nearest)), 2 * radius
     return nearest
 

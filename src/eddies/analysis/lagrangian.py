@@ -95,11 +95,11 @@ def differences(model: PathStatistics, truth: PathStatistics) -> dict[str, float
     def log_ratio(name: str, first: int = 0) -> float:
         return rms_log_ratio(getattr(model, name)[first:], getattr(truth, name)[first:])
 
-    apart = model.acceleration_correlation - truth.acceleration_correlation
+    difference = model.acceleration_correlation - truth.acceleration_correlation
     return {
         "structure_error": log_ratio("structure"),
         "flatness_error": log_ratio("flatness"),
-        "acceleration_correlation_error": float(np.sqrt(np.mean(apart**2))) if apart.size else np.nan,
+        "acceleration_correlation_error": float(np.sqrt(np.mean(difference**2))) if difference.size else np.nan,
         "acceleration_variance_error": log_ratio("acceleration_variance"),
         "pair_dispersion_error": log_ratio("pair_dispersion", 1),
         "tetrad_size_error": log_ratio("tetrad_size", 1),
@@ -202,8 +202,8 @@ def pair_dispersion(position: Iterable[np.ndarray], groups: Sequence[np.ndarray]
     return np.transpose(spread)
 
 
-def near(position: np.ndarray, length: float, chosen: np.ndarray,
-         radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def neighbor_pairs(position: np.ndarray, length: float, chosen: np.ndarray,
+                   radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The other rows of positions (n, 3) within a radius of each of the chosen rows (m,), periodic with `length`.
 
     Returns for each pair the place in `chosen`, the other row and the distance. Places are in ascending order.
@@ -212,8 +212,8 @@ def near(position: np.ndarray, length: float, chosen: np.ndarray,
     places = np.repeat(np.arange(chosen.size), np.diff(offsets))
     others = rows != chosen[places]
     places, rows = places[others], rows[others]
-    apart = minimum_image(position[rows] - position[chosen[places]], length)
-    return places, rows, np.sqrt(np.sum(apart**2, axis=1))
+    displacement = minimum_image(position[rows] - position[chosen[places]], length)
+    return places, rows, np.sqrt(np.sum(displacement**2, axis=1))
 
 
 def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], tolerance: float,
@@ -223,9 +223,10 @@ def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], to
     The first particle of a pair is one of the first `followed` rows. Each pair appears once.
     """
     first = np.arange(min(followed, len(position)))
-    first, second, apart = near(position, length, first, 1.001 * (1 + tolerance) * max(distances, default=0.0))
+    radius = 1.001 * (1 + tolerance) * max(distances, default=0.0)
+    first, second, distance = neighbor_pairs(position, length, first, radius)
     pairs, once = np.stack([first, second]), second > first
-    at_distance = [pairs[:, once & (np.abs(apart - distance) <= tolerance * distance)] for distance in distances]
+    at_distance = [pairs[:, once & (np.abs(distance - wanted) <= tolerance * wanted)] for wanted in distances]
     return [chosen[:, np.lexsort(chosen[::-1])] for chosen in at_distance]
 
 
@@ -239,8 +240,8 @@ def nearest_rows(position: np.ndarray, length: float, chosen: np.ndarray, count:
     nearest = np.full((count, chosen.size), -1)
     missing, radius = np.arange(chosen.size), 2 * length / len(position) ** (1 / 3)
     while missing.size:
-        places, rows, apart = near(position, length, chosen[missing], radius)
-        rows = rows[np.lexsort((rows, apart, places))]
+        places, rows, distance = neighbor_pairs(position, length, chosen[missing], radius)
+        rows = rows[np.lexsort((rows, distance, places))]
         ends = np.cumsum(np.bincount(places, minlength=missing.size))
         begins = np.append(0, ends[:-1])
         enough = ends - begins >= count

@@ -25,8 +25,8 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.cores import threads
-from eddies.io.checksums import find_damage, known_sums, open_to_read
-from eddies.io.errors import WriteError, unreadable
+from eddies.io.checksums import find_damage, open_to_read, table_checksum
+from eddies.io.errors import WriteError, read_error
 from eddies.io.frame_segments import FrameSegments
 from eddies.io.hdf5 import in_files, write_block
 from eddies.io.new_files import HEADER_BYTES, new_file, own_part, writing
@@ -106,7 +106,7 @@ class CheckpointDirectory:
             self.path.mkdir(parents=True, exist_ok=True)
             return json.dumps({"step": step, "format": FORMAT, "fingerprint": self.fingerprint,
                                "computed_by": _computed_by(), "values": values,
-                               "files": {name: known_sums(self.path / name) for name in files}})
+                               "files": {name: table_checksum(self.path / name) for name in files}})
 
         if on_first_rank(self.comm, path.exists):
             return
@@ -222,7 +222,7 @@ def _content(path: Path) -> dict[str, Any] | None:
         return {"step": _step_of(path), "format": 0} if path.is_dir() else Checkpoint(path).content
     except OSError as error:
         if error.errno not in (None, errno.ENOENT):
-            raise unreadable(path, error) from None
+            raise read_error(path, error) from None
         return None
     except (ValueError, KeyError, RuntimeError):  # ProductError is a RuntimeError
         return None

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 
-from eddies.io.errors import ProductError, file_errors, make_again, unreadable
+from eddies.io.errors import ProductError, file_errors, read_error, remedy_for
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -90,7 +90,7 @@ class CheckedFile:
             wrong = _first_wrong(self._descriptor, first, part, self._size, skipped)
             if wrong is not None:
                 words = _damage(self.path, wrong, self._naming)
-                raise ProductError(f"{words}; {make_again(self.path.stem)}")
+                raise ProductError(f"{words}; {remedy_for(self.path.stem)}")
             done += len(part)
         return done
 
@@ -123,7 +123,7 @@ def add_checksums(comm: MPI.Comm, path: Path) -> None:
         on_first_rank(comm, append)
 
 
-def known_sums(path: Path) -> int | None:
+def table_checksum(path: Path) -> int | None:
     """A checksum of all checksums of a file, which identifies the file; None if it has no checksums."""
     with _opened(path) as descriptor:
         size = _covered_bytes(descriptor)
@@ -133,8 +133,9 @@ def known_sums(path: Path) -> int | None:
 def find_damage(comm: MPI.Comm, path: Path, known: int | None = None) -> str | None:
     """Compare a file with its checksums; collective.
 
-    Returns a line with file, dataset and frame of the first damage, or None. `known` is the result of `known_sums` for
-    the expected file. Raises ProductError, on all ranks, if the system refuses to read the file: it may be undamaged.
+    Returns a line with file, dataset and frame of the first damage, or None. `known` is the result of `table_checksum`
+    for the expected file. Raises ProductError, on all ranks, if the system refuses to read the file: it may be
+    undamaged.
     """
     from eddies.parallel.broadcast import on_all_ranks, on_first_rank
     from eddies.parallel.reduction import global_min
@@ -144,7 +145,7 @@ def find_damage(comm: MPI.Comm, path: Path, known: int | None = None) -> str | N
             return f"{path}: missing"
         with _opened(path) as descriptor:
             size = _covered_bytes(descriptor)
-        if size is not None and known not in (None, known_sums(path)):
+        if size is not None and known not in (None, table_checksum(path)):
             return f"{path}: is not the file that was written, its checksums are different"
         return f"{path}: {MISSING}" if size is None else size
 
@@ -157,7 +158,7 @@ def find_damage(comm: MPI.Comm, path: Path, known: int | None = None) -> str | N
         try:
             return action()
         except OSError as error:
-            raise unreadable(path, error) or ProductError(f"{path}: cannot be read ({error})") from None
+            raise read_error(path, error) or ProductError(f"{path}: cannot be read ({error})") from None
 
     size = on_first_rank(comm, lambda: reading(look))
     if isinstance(size, str):

@@ -13,8 +13,8 @@ import h5py
 import numpy as np
 
 from eddies.io.checksums import open_to_read
-from eddies.io.errors import ProductError, make_again, unreadable
-from eddies.io.quantities import python_value, words_on
+from eddies.io.errors import ProductError, read_error, remedy_for
+from eddies.io.quantities import dataset_attributes, python_value
 
 try:
     import xarray
@@ -29,7 +29,7 @@ EDGE = 2 * math.pi  # of the cube, in units of L
 
 
 @dataclass(frozen=True)
-class MadeArray:
+class ComputedArray:
     """An array that is not in a file. Its frames, along the first axis, are computed when they are used."""
 
     place: str  # the path that it would have in rollout.h5, which gives its units and description
@@ -38,7 +38,7 @@ class MadeArray:
     make: Callable[[Sequence[int]], Sequence[np.ndarray]]  # returns the frames with these indices
 
     @classmethod
-    def of(cls, place: str, values: np.ndarray) -> MadeArray:
+    def of(cls, place: str, values: np.ndarray) -> ComputedArray:
         """An array with known values."""
         return cls(place, values.shape, values.dtype, lambda frames: [values[frame] for frame in frames])
 
@@ -50,7 +50,7 @@ class MadeArray:
     @property
     def attrs(self) -> dict[str, str]:
         """Units, axes, description."""
-        return words_on("rollout", self.place)
+        return dataset_attributes("rollout", self.place)
 
     def __getitem__(self, key: Any) -> np.ndarray:
         first, *others = (key if isinstance(key, tuple) else (key,)) or (slice(None),)
@@ -83,7 +83,7 @@ def open_group(path: Path, name: str) -> Any:
                          for key, array in arrays.items()}, attributes)
 
 
-def made_group(arrays: Mapping[str, MadeArray]) -> Any:
+def computed_group(arrays: Mapping[str, ComputedArray]) -> Any:
     """Computed arrays by name, in the form in which `open_group` returns stored ones."""
     if xarray is None:
         return {key: array[:] for key, array in arrays.items()}
@@ -108,8 +108,8 @@ def opened(path: Path) -> h5py.File:
     try:
         return open_to_read(path)
     except OSError as error:
-        raise unreadable(path, error) or ProductError(
-            f"{path}: cannot be opened ({error}); {make_again(path.stem)}") from None
+        raise read_error(path, error) or ProductError(
+            f"{path}: cannot be opened ({error}); {remedy_for(path.stem)}") from None
 
 
 def _dataset(arrays: Mapping[str, tuple[Any, Callable[[tuple], np.ndarray]]], attributes: Mapping[str, Any]) -> Any:
@@ -138,7 +138,7 @@ if xarray is not None:
     class LazyArray(BackendArray):
         """An array of which xarray reads only the parts that are used."""
 
-        def __init__(self, array: h5py.Dataset | MadeArray, read: Callable[[tuple], np.ndarray]) -> None:
+        def __init__(self, array: h5py.Dataset | ComputedArray, read: Callable[[tuple], np.ndarray]) -> None:
             self.shape, self.dtype, self._read = array.shape, array.dtype, read
 
         def __getitem__(self, key: BasicIndexer | OuterIndexer) -> np.ndarray:

@@ -28,8 +28,8 @@ def write_error(path: Path | str, error: OSError, wanted: int = 0) -> WriteError
     """The error for a file that cannot be written, read or removed. If the disk is full, it names the bytes wanted."""
     reason = error.strerror or error
     if error.errno in NO_ROOM:
-        return WriteError(f"{path}: cannot be written: {reason}: {room(path, wanted)}; make room, then run the command "
-                          "again")
+        return WriteError(f"{path}: cannot be written: {reason}: {space_in_words(path, wanted)}; make room, then run "
+                          "the command again")
     return WriteError(f"{path}: {reason}; check the file, its directory and the space on the disk")
 
 
@@ -42,7 +42,7 @@ def file_errors(path: Path | str, wanted: int = 0) -> Iterator[None]:
         raise write_error(error.filename or path, error, wanted) from None
 
 
-def room(path: Path | str, wanted: int) -> str:
+def space_in_words(path: Path | str, wanted: int) -> str:
     """A text with the bytes wanted for a file, unless they are unknown (0), and the free bytes of its file system."""
     disk = os.statvfs(next(place for place in Path(path).absolute().parents if place.is_dir()))
     free = disk.f_bavail * disk.f_frsize
@@ -51,7 +51,7 @@ def room(path: Path | str, wanted: int) -> str:
     return f"{wanted} bytes wanted, {free} free" if wanted else f"{free} bytes free"
 
 
-def unreadable(path: Path | str, error: OSError) -> ProductError | None:
+def read_error(path: Path | str, error: OSError) -> ProductError | None:
     """The error for a file that the system refuses to read; None if HDF5 has found its content damaged."""
     if error.errno is None:
         return None
@@ -59,6 +59,6 @@ def unreadable(path: Path | str, error: OSError) -> ProductError | None:
                         "the file system, or give another path")
 
 
-def make_again(kind: str) -> str:
+def remedy_for(kind: str) -> str:
     """The remedy for a product that cannot be used. Its stage would keep the file, so the user has to remove it."""
     return f"remove it and run `eddies {MAKER_OF[kind].name}` again" if kind in MAKER_OF else "make it again"

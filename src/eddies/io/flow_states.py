@@ -25,7 +25,7 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.io.checksums import open_to_read
-from eddies.io.errors import ProductError, unreadable
+from eddies.io.errors import ProductError, read_error
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import open_product
 from eddies.io.provenance import read_provenance
@@ -135,7 +135,7 @@ def _open(path: Path) -> h5py.File:
     try:
         return open_to_read(path)
     except OSError as error:
-        if problem := unreadable(path, error):
+        if problem := read_error(path, error):
             raise problem from None
         with open(path, "rb") as file:
             start = file.read(max(map(len, OTHER_FORMATS)))
@@ -238,7 +238,7 @@ def read_spectrum(path: Path) -> tuple[np.ndarray, np.ndarray]:
         with warnings.catch_warnings(action="ignore"):  # of an empty file
             table = np.loadtxt(path, ndmin=2, encoding="utf-8")
     except OSError as error:
-        raise unreadable(path, error) or ProductError(f"{path}: cannot be read") from None
+        raise read_error(path, error) or ProductError(f"{path}: cannot be read") from None
     except ValueError as error:
         raise ProductError(f"{path}: holds no spectrum ({error}); write a wavenumber and E(k) in each line") from None
     if table.shape[1] != 2 or not np.isfinite(table).all():

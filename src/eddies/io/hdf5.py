@@ -15,7 +15,7 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.io.checksums import ATTRIBUTE, WORDS, open_to_read
-from eddies.io.errors import ProductError, file_errors, make_again, unreadable
+from eddies.io.errors import ProductError, file_errors, read_error, remedy_for
 from eddies.io.new_files import HEADER_BYTES, frame_bytes, new_file, own_part, writing
 from eddies.io.provenance import FORMAT, environment, has_this_format, identity, read_json, read_provenance
 from eddies.io.quantities import conventions, describe, python_value
@@ -193,7 +193,7 @@ def read_times(dataset: h5py.Dataset) -> np.ndarray:
 
 def unfit(dataset: h5py.Dataset, problem: str) -> ProductError:
     """The error for a dataset with content that no stage writes."""
-    return ProductError(f"{dataset.file.filename}: {dataset.name}, {problem}; {make_again(dataset.file.attrs['kind'])}")
+    return ProductError(f"{dataset.file.filename}: {dataset.name}, {problem}; {remedy_for(dataset.file.attrs['kind'])}")
 
 
 def _open_checked(path: Path, kind: str | None) -> h5py.File:
@@ -205,7 +205,7 @@ def _open_checked(path: Path, kind: str | None) -> h5py.File:
             raise ProductError(f"{path}: no such file; {remedy}")
         file = open_to_read(path)
     except OSError as error:
-        raise unreadable(path, error) or ProductError(
+        raise read_error(path, error) or ProductError(
             f"{path}: damaged or not an HDF5 file ({error}); make it again, or give another file") from None
     try:
         if problem := _problem(file, kind, remedy):
@@ -230,5 +230,5 @@ def _problem(file: h5py.File, kind: str | None, remedy: str) -> str | None:
     if not has_this_format(file):
         version = read_json(file, "provenance").get("eddies", "of unknown version")
         name = stored.replace("_", " ")
-        return f"written by eddies {version}, whose {name} this version does not read; {make_again(stored)}"
+        return f"written by eddies {version}, whose {name} this version does not read; {remedy_for(stored)}"
     return None

@@ -39,7 +39,7 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.io.checksums import add_checksums
-from eddies.io.errors import ProductError, WriteError, file_errors, room
+from eddies.io.errors import ProductError, WriteError, file_errors, space_in_words
 from eddies.io.run_lock import RunTakenOver
 from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank
 from eddies.parallel.stop import Stopped
@@ -142,8 +142,8 @@ def writing(group: h5py.Group | h5py.Dataset, size: int) -> Iterator[None]:
         yield
     except (OSError, RuntimeError) as error:
         new.broken = True
-        raise ProductError(f"{new.path}: cannot be written: {error}: {room(new.path, size)}; make room, or check the "
-                           "disk, then run the command again") from None
+        raise ProductError(f"{new.path}: cannot be written: {error}: {space_in_words(new.path, size)}; make room, or "
+                           "check the disk, then run the command again") from None
 
 
 def writing_failed() -> bool:

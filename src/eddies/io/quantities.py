@@ -132,11 +132,11 @@ def python_value(value: Any) -> Any:
 
 def describe(dataset: h5py.Dataset) -> None:
     """Write the attributes `units`, `axes` and `description` of a known dataset; collective."""
-    for name, words in words_on(dataset.file.attrs.get("kind", ""), dataset.name.strip("/")).items():
+    for name, words in dataset_attributes(dataset.file.attrs.get("kind", ""), dataset.name.strip("/")).items():
         dataset.attrs[name] = words
 
 
-def words_on(kind: str, path: str) -> dict[str, str]:
+def dataset_attributes(kind: str, path: str) -> dict[str, str]:
     """Units, axes and description of the dataset at a path in a product of a kind; empty if it is unknown."""
     group, _, name = path.rpartition("/")
     quantity = next((each for pattern, each in QUANTITIES.items() if fnmatchcase(path, pattern)), None)

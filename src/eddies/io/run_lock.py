@@ -26,7 +26,7 @@ from eddies.clock import duration
 from eddies.errors import UserError
 from eddies.io.errors import NO_ROOM, WriteError, file_errors, write_error
 from eddies.parallel.broadcast import on_first_rank
-from eddies.parallel.stop import LOOK_SECONDS, Loss
+from eddies.parallel.stop import LOOK_SECONDS, LockLoss
 
 log = logging.getLogger("eddies")
 
@@ -120,17 +120,17 @@ class RunLock:
 
     def __init__(self, directory: Path, holder: Holder, made: bool) -> None:
         self.directory, self.path, self.holder, self.made = directory, directory / LOCK, holder, made
-        self._look_at = 0.0
+        self._next_look = 0.0
         self._lost: RunTakenOver | None = None
         self._ended = threading.Event()
         self._signs = threading.Thread(target=self._give_signs, name="run lock", daemon=True)
         self._signs.start()
 
-    def loss(self) -> RunTakenOver | None:
+    def lock_lost(self) -> RunTakenOver | None:
         """The error to raise if another job has taken over the directory, else None. Looks at most once a second."""
         now = time.monotonic()
-        if self._lost is None and now >= self._look_at:
-            self._look_at = now + LOOK_SECONDS
+        if self._lost is None and now >= self._next_look:
+            self._next_look = now + LOOK_SECONDS
             with contextlib.suppress(OSError):  # the file system fails for a while: nothing is known
                 found = find_lock(self.directory)
                 if found is None:
@@ -157,8 +157,8 @@ class RunLock:
 
 
 @contextlib.contextmanager
-def lock_directory(comm: MPI.Comm, directory: Path, take_over: bool = False) -> Iterator[Loss]:
-    """Hold a run directory, which is made if it is missing; collective. Yields `RunLock.loss` of rank 0.
+def lock_directory(comm: MPI.Comm, directory: Path, take_over: bool = False) -> Iterator[LockLoss]:
+    """Hold a run directory, which is made if it is missing; collective. Yields `RunLock.lock_lost` of rank 0.
 
     A stale lock is replaced. With `take_over`, any lock is replaced; its job then ends at its next step.
 
@@ -173,7 +173,7 @@ def lock_directory(comm: MPI.Comm, directory: Path, take_over: bool = False) -> 
         raise write_error(directory, error) if error.errno in NO_ROOM else WriteError(
             f"{directory}: cannot be written ({error.strerror}); choose another --output") from None
     try:
-        yield locks[0].loss if locks else lambda: None
+        yield locks[0].lock_lost if locks else lambda: None
     finally:
         for lock in locks:
             with contextlib.suppress(OSError):  # the lock becomes stale by itself

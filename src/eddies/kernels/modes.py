@@ -36,19 +36,19 @@ class ModePasses:
             raise ValueError(f"weights of sizes {sizes} for modes of shape {self._shape}")
         self._weights = _Weights(z, y, x, *map(address, self._arrays))
 
-    def image(self, given: np.ndarray, modes: np.ndarray) -> tuple[np.ndarray, float]:
+    def apply(self, given: np.ndarray, modes: np.ndarray) -> tuple[np.ndarray, float]:
         """I = P (scale given) + penalty modes, where P projects on solenoidal modes, and <I, modes>."""
-        image = np.empty_like(modes)
-        return image, self._call("modes_image", ctypes.c_double, [], [given, modes, image])
+        applied = np.empty_like(modes)
+        return applied, self._call("modes_image", ctypes.c_double, [], [given, modes, applied])
 
-    def descend(self, length: float, inverse: np.ndarray, direction: np.ndarray, image: np.ndarray,
+    def descend(self, length: float, inverse: np.ndarray, direction: np.ndarray, applied: np.ndarray,
                 solution: np.ndarray, residual: np.ndarray) -> float:
-        """solution += length direction, residual -= length image; returns <residual, inverse residual>."""
-        return self._call("modes_descend", ctypes.c_double, [length, inverse], [direction, image, solution, residual])
+        """solution += length direction, residual -= length applied; returns <residual, inverse residual>."""
+        return self._call("modes_descend", ctypes.c_double, [length, inverse], [direction, applied, solution, residual])
 
-    def turn(self, share: float, inverse: np.ndarray, residual: np.ndarray, direction: np.ndarray) -> None:
-        """direction = inverse residual + share direction."""
-        self._call("modes_turn", None, [share, inverse], [residual, direction])
+    def update_direction(self, beta: float, inverse: np.ndarray, residual: np.ndarray, direction: np.ndarray) -> None:
+        """direction = inverse residual + beta direction."""
+        self._call("modes_turn", None, [beta, inverse], [residual, direction])
 
     def _call(self, name: str, result: type | None, given: list, vectors: list[np.ndarray]) -> float:
         """Call a function with `given`, a number and an array (kz, ky, kx) or neither, and with vectors."""

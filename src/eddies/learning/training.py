@@ -66,19 +66,19 @@ class Training:
 
     def _begin(self, number: int) -> None:
         """Begin a phase."""
-        self.number, self.best_error, self.best, self.best_at = number, np.inf, self._weights(), 0
+        self.phase_number, self.best_error, self.best, self.best_at = number, np.inf, self._weights(), 0
         if self.running:
             self.optimizer = Adam(self.comm, self.model.parameters(), self.phase.steps, *self.phase.rates)
 
     @property
     def running(self) -> bool:
         """Whether a phase is left."""
-        return self.number < len(self.phases)
+        return self.phase_number < len(self.phases)
 
     @property
     def phase(self) -> Phase:
         """The current phase."""
-        return self.phases[self.number]
+        return self.phases[self.phase_number]
 
     @property
     def steps(self) -> int:
@@ -93,7 +93,7 @@ class Training:
     @property
     def done(self) -> float:
         """Fraction of the work of all phases that is done."""
-        before = [phase.work for phase in self.phases[:self.number]]
+        before = [phase.work for phase in self.phases[:self.phase_number]]
         done = sum(work.sum() for work in (*before, self.phase.work[:self.optimizer.taken]))
         return float(done / sum(phase.work.sum() for phase in self.phases))
 
@@ -101,7 +101,7 @@ class Training:
         """One step of the current phase, and a validation if one is due."""
         phase, rate = self.phase, self.optimizer.learning_rate
         start = {"start_error": self._error_of(phase.validate)} if phase.validate and self.optimizer.taken == 0 else {}
-        row = {"phase": float(self.number), "step": float(self.steps), "learning_rate": rate, **start,
+        row = {"phase": float(self.phase_number), "step": float(self.steps), "learning_rate": rate, **start,
                **phase.take(self.optimizer, self.optimizer.taken)}
         place = f"step {self.steps + 1} of the training ({phase.name})"
         for name in ("loss", "gradient_norm"):
@@ -118,7 +118,7 @@ class Training:
         row["seconds"] = self.seconds
         self.history.append(row)
         if last:
-            self._begin(self.number + 1)
+            self._begin(self.phase_number + 1)
 
     @property
     def cost(self) -> list[dict[str, Any]]:
@@ -127,7 +127,7 @@ class Training:
         The error is the validation error of the weights at its end, None without validation.
         """
         finished, before = [], 0.0
-        for number, phase in enumerate(self.phases[:self.number]):
+        for number, phase in enumerate(self.phases[:self.phase_number]):
             rows = [row for row in self.history if row["phase"] == number]
             errors = [row[name] for row in rows for name in ("start_error", "validation_error") if name in row]
             finished.append({"phase": phase.name, "steps": len(rows), "seconds": rows[-1]["seconds"] - before,
@@ -144,7 +144,7 @@ class Training:
         """The whole state for a checkpoint: numbers and arrays by name."""
         parts = {"model": self._weights(), "best": self.best, "history": self.columns(),
                  "optimizer": self.optimizer.state_dict()}
-        return {"number": self.number, "best_error": self.best_error, "best_at": self.best_at,
+        return {"number": self.phase_number, "best_error": self.best_error, "best_at": self.best_at,
                 "names": {part: list(values) for part, values in parts.items()},
                 **{f"{part} {name}": value if isinstance(value, int) else np.atleast_1d(value)
                    for part, values in parts.items() for name, value in values.items()}}

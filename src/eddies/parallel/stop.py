@@ -23,7 +23,7 @@ _NOTHING, _CHECKPOINT, _TIME, _FILE, _SIGNALS = range(5)
 _LOST = 1000
 
 # Returns the error to raise, or None.
-Loss = Callable[[], UserError | None]
+LockLoss = Callable[[], UserError | None]
 
 
 class Stopped(Exception):
@@ -50,25 +50,25 @@ class StopRequest:
         self.comm, self.signals, self.stop_file = comm, signals, stop_file
         now = time.monotonic()
         self._end, self._interval = now + max_seconds, checkpoint_seconds
-        self._checkpoint_at, self._look_at = now + checkpoint_seconds, now
+        self._checkpoint_at, self._next_look = now + checkpoint_seconds, now
         self._answer = _NOTHING
-        self._losses: list[Loss] = []
+        self._lock_losses: list[LockLoss] = []
 
     @contextlib.contextmanager
-    def watching(self, loss: Loss) -> Iterator[None]:
-        """Within this context, the next call raises on all ranks the error that `loss` returns on rank 0."""
-        self._losses.append(loss)
+    def watching(self, lock_lost: LockLoss) -> Iterator[None]:
+        """Within this context, the next call raises on all ranks the error that `lock_lost` returns on rank 0."""
+        self._lock_losses.append(lock_lost)
         try:
             yield
         finally:
-            self._losses.remove(loss)
+            self._lock_losses.remove(lock_lost)
 
     def __call__(self) -> bool:
-        """Return, on all ranks, whether any rank has a reason to stop; collective. Raises a watched loss."""
+        """Return, on all ranks, whether any rank has a reason to stop; collective. Raises the error of a lost lock."""
         if self._answer <= _CHECKPOINT:
             self._answer = int(global_max(self.comm, self._own_answer()))
             if self._answer == _LOST:
-                on_first_rank(self.comm, self._raise_loss)
+                on_first_rank(self.comm, self._raise_lock_loss)
             if self._answer > _CHECKPOINT and self.stop_file is not None:
                 on_first_rank(self.comm, partial(self.stop_file.unlink, missing_ok=True))
         return self._answer > _CHECKPOINT
@@ -94,21 +94,21 @@ class StopRequest:
         """Start the interval to the next checkpoint."""
         self._checkpoint_at = time.monotonic() + self._interval
 
-    def _raise_loss(self) -> None:
-        error = next(filter(None, (loss() for loss in self._losses)), None)
+    def _raise_lock_loss(self) -> None:
+        error = next(filter(None, (lock_lost() for lock_lost in self._lock_losses)), None)
         if error is not None:
             raise error
 
     def _own_answer(self) -> int:
-        if any(loss() for loss in self._losses):
+        if any(lock_lost() for lock_lost in self._lock_losses):
             return _LOST
         if self.signals:
             return _SIGNALS + self.signals[0]
         if self.comm.rank > 0:
             return _NOTHING
         now = time.monotonic()
-        if self.stop_file is not None and now >= self._look_at:
-            self._look_at = now + LOOK_SECONDS
+        if self.stop_file is not None and now >= self._next_look:
+            self._next_look = now + LOOK_SECONDS
             if os.path.exists(self.stop_file):  # unlike Path.exists this never raises on this rank alone
                 return _FILE
         if now >= self._end:

@@ -65,7 +65,7 @@ class LeastSquares:
         if torch.is_grad_enabled():
             return self.gathered(missing, points) - self.penalty * modes
         spread = self.grid.to_modes(points.spread(missing))
-        return torch.from_numpy(self._passes.image(spread.numpy(), -modes.numpy())[0])
+        return torch.from_numpy(self._passes.apply(spread.numpy(), -modes.numpy())[0])
 
     def projected(self, modes: Tensor) -> Tensor:
         """Projection P of modes; differentiable."""
@@ -95,12 +95,12 @@ class LeastSquares:
         left, taken = self.size(right, count), 0
         while (left > enough and taken < most) if iterations is None else (taken < iterations and left > 0):
             values = self.grid.at(torch.from_numpy(direction), points)
-            image, product = passes.image(self.grid.to_modes(points.spread(values)).numpy(), direction)
+            applied, product = passes.apply(self.grid.to_modes(points.spread(values)).numpy(), direction)
             length = left / self._over_ranks(product)
             at_points += length * values
             before = left
-            left = self._over_ranks(passes.descend(length, inverse, direction, image, modes, residual))
-            passes.turn(left / before, inverse, residual, direction)
+            left = self._over_ranks(passes.descend(length, inverse, direction, applied, modes, residual))
+            passes.update_direction(left / before, inverse, residual, direction)
             taken += 1
         return Solution(torch.from_numpy(modes), at_points, taken, left)
 

@@ -67,7 +67,7 @@ class RememberedVelocity:
             worth, points = torch.exp(-turn / (2 * self.memory)), grid.points(particles.position)
             self._penalty = self._next_penalty(worth)
             equations = LeastSquares(grid, self.solver.equations.inside, self._penalty)
-            prior = worth * self.solver.carried(self.forecast(latest, step), step, drift)
+            prior = worth * self.solver.advected(self.forecast(latest, step), step, drift)
             missing = relative - grid.at(prior, points)
             right = equations.descent(missing, points, torch.zeros_like(prior))
             change = equations.solve(points, right, count, self.solver.tolerance**2 * square, None,

@@ -257,9 +257,9 @@ class ResolvedVelocity:
         step, rate = time - near.time, near.rate
         for other in others:
             between = near.time - other.time
-            rate = rate + step / (2 * between) * (rate - self.carried(other.rate, between, mean))
+            rate = rate + step / (2 * between) * (rate - self.advected(other.rate, between, mean))
         worth = 1 / (1 + (2 * self.grid.wavenumber_squared.sqrt() * speed * step) ** 6)
-        return worth * self.carried(near.velocity + step * rate, step, mean)
+        return worth * self.advected(near.velocity + step * rate, step, mean)
 
     def forget(self) -> None:
         """Discard predictions: the next solve starts from zero."""
@@ -280,7 +280,7 @@ class ResolvedVelocity:
         self._moments = [_Moment(float(time), *pair) for time, pair in zip(state["times"], modes)]
         self.speed = float(state["speed"])
 
-    def carried(self, modes: Tensor, step: float, mean: np.ndarray) -> Tensor:
+    def advected(self, modes: Tensor, step: float, mean: np.ndarray) -> Tensor:
         """Modes of a field that has moved with the mean velocity for the time `step`."""
         turns = [torch.exp(-1j * step * velocity * k) for k, velocity in zip(self.grid.wavevector, mean)]
         return math.prod(turns) * modes

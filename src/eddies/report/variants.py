@@ -24,7 +24,7 @@ Row = Mapping[str, Any]
 
 KEY = "variants"
 COST = "wall_seconds"
-LOOKS = list(zip((MODEL, TRUTH, SECOND, FOURTH, THIRD, DNS, FILTERED), "os^DvPX"))
+MARKERS = list(zip((MODEL, TRUTH, SECOND, FOURTH, THIRD, DNS, FILTERED), "os^DvPX"))
 # Columns of the table after the measures: key in the rows, title.
 COSTS = {"end": "end of the rollout (T)", "stopped_at": "became unstable at (T)", "wall_seconds": "wall seconds per T",
          "wall_seconds_low": "wall seconds, lower quartile", "wall_seconds_high": "wall seconds, upper quartile",
@@ -58,10 +58,10 @@ class ErrorAgainstTime:
         return [name for name in (replaced.get(name, name) for name in DRAWN) if self.finished(name)]
 
     @property
-    def looks(self) -> dict[str, tuple[str, str]]:
+    def markers(self) -> dict[str, tuple[str, str]]:
         """Colour and marker of each kind of method."""
         kinds = dict.fromkeys(row["kind"] for row in self.rows)
-        return {kind: LOOKS[number % len(LOOKS)] for number, kind in enumerate(kinds)}
+        return {kind: MARKERS[number % len(MARKERS)] for number, kind in enumerate(kinds)}
 
     @property
     def summary(self) -> list[str]:
@@ -126,7 +126,7 @@ def scatter(table: ErrorAgainstTime, measures: Sequence[str]) -> Figure:
     """Draw error against wall seconds per turnover, with one panel for each measure."""
     columns = min(len(measures), 2)
     styles = [Line2D([], [], color=colour, marker=marker, linestyle="", label=kind)
-              for kind, (colour, marker) in table.looks.items()]
+              for kind, (colour, marker) in table.markers.items()]
     if table.stopped():
         styles.append(Line2D([], [], color=DNS, marker="x", linestyle="", label="unstable, at this time"))
     styles.append(Line2D([], [], color=GUIDE, linestyle="--", label="Pareto front"))
@@ -150,7 +150,7 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
     costs = [row[key] for row in [*rows, *stopped] for key in (COST, "wall_seconds_low", "wall_seconds_high")]
     _set_limits(axis, costs, [row[measure] for row in rows])
     for row in rows:
-        colour, marker = table.looks[row["kind"]]
+        colour, marker = table.markers[row["kind"]]
         chosen = row["name"] == table.subject
         bars = [[row[COST] - row["wall_seconds_low"]], [row["wall_seconds_high"] - row[COST]]]
         spread = row.get(f"{measure}_spread") or 0.0
@@ -158,7 +158,7 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
         axis.errorbar(row[COST], row[measure], [[down], [spread]], np.maximum(bars, 0), color=colour, marker=marker,
                       elinewidth=1, markersize=9 if chosen else 6, markeredgecolor=DNS if chosen else colour, zorder=4)
     for row in stopped:
-        axis.plot(row[COST], _top(axis), color=table.looks[row["kind"]][0], marker="x", markersize=7,
+        axis.plot(row[COST], _top(axis), color=table.markers[row["kind"]][0], marker="x", markersize=7,
                   markeredgewidth=1.8, zorder=4)
     front = pareto_front([row[COST] for row in rows], [row[measure] for row in rows])
     axis.plot([rows[index][COST] for index in front], [rows[index][measure] for index in front], color=GUIDE,

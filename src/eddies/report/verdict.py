@@ -34,7 +34,8 @@ class Judged:
     """A number and its mark.
 
     `error` is compared with the largest error that is good and the largest that is fair. `within` writes these limits
-    for the table. `words` name the number in the table, `short` names it in sentences, `beside` describes the baseline.
+    for the table. `words` name the number in the table, `short` names it in sentences, `baseline_text` describes the
+    baseline.
     """
 
     key: str
@@ -44,7 +45,7 @@ class Judged:
     error: float
     good: float
     fair: float
-    beside: str = ""
+    baseline_text: str = ""
     within: str = "≤{:.2g}"
     judged: bool = True
 
@@ -59,7 +60,7 @@ class Judged:
     def metric(self) -> Metric:
         """The row of this number in the table."""
         return Metric(self.key, self.words, {
-            "this run": self.value, "verdict": self.mark, "beside it": self.beside,
+            "this run": self.value, "verdict": self.mark, "beside it": self.baseline_text,
             "good": self.within.format(self.good), "fair": self.within.format(self.fair)})
 
 
@@ -82,9 +83,9 @@ def section(sections: Mapping[str, Section], warned: bool) -> Section:
     rollout, model, kernel = (numbers.get(key, {}) for key in ("rollout", "model", "kernel"))
     of_rollout, of_model, of_kernel = [*_rollout(rollout)], [*_model(model)], [*_kernel(kernel)]
     text = [*_sentences(rollout, of_rollout),
-            *(f"Model: {each.short} {each.value:.2g}, {each.mark} ({each.beside})." for each in of_model),
+            *(f"Model: {each.short} {each.value:.2g}, {each.mark} ({each.baseline_text})." for each in of_model),
             *(f"Learned kernel: {each.short} {each.value:.2g}, {KERNEL_WORDS[each.mark]} the "
-              f"{each.beside.replace(': ', ' (')})." for each in of_kernel)]
+              f"{each.baseline_text.replace(': ', ' (')})." for each in of_kernel)]
     if "forced" in sections:
         text.append("A forced flow differs from its truth after one or two turnovers. The section on the stationary "
                     "state compares its averages.")
@@ -140,12 +141,12 @@ def _rollout(numbers: Mapping[str, Any]) -> Iterator[Judged]:
 def _model(numbers: Mapping[str, Any]) -> Iterator[Judged]:
     error, gradient = numbers.get("acceleration_error"), numbers.get("filtered_pressure_gradient_error")
     if error is not None:
-        baseline, beside = 1.0, "no model: 1"
+        baseline, baseline_text = 1.0, "no model: 1"
         if gradient is not None and gradient < 1:
-            baseline, beside = gradient, f"exact filtered pressure gradient: {gradient:.2g}"
+            baseline, baseline_text = gradient, f"exact filtered pressure gradient: {gradient:.2g}"
         yield Judged("acceleration_error", "model: acceleration error at the true state",
                      "acceleration error at the true state", error, error,
-                     *(limit * baseline for limit in BESIDE_GRADIENT), beside)
+                     *(limit * baseline for limit in BESIDE_GRADIENT), baseline_text)
 
 
 def _kernel(numbers: Mapping[str, Any]) -> Iterator[Judged]:

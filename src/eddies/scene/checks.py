@@ -269,7 +269,7 @@ def check_coarse_grid(eulerian: Eulerian | None, cells: int, flow: Flow, model: 
         eulerian = Eulerian()
     elif not cells:
         yield "eulerian", 'only read with [simulation] method = "eulerian"; set it, or remove [eulerian]'
-    if cells > flow.cells:
+    if cells > flow.cells and eulerian.start != "particles":
         yield "eulerian.cells", (f"must be at most [flow] cells = {flow.cells}, because the coarse grid starts from "
                                  "that flow; lower it")
     if eulerian.form.learned and model and not model.damping:

@@ -21,7 +21,7 @@ from eddies.scene.values import SceneError
 
 BUILT_IN = Path(__file__).parents[1] / "scenes"
 VARIANT = "variant"
-OF_FILES = ("base", "unset")  # keys that only a file may have
+FILE_ONLY_KEYS = ("base", "unset")  # keys that only a file may have
 FILE_KEYS = {"initial": ("path",), "tracks": ("path",), "model": ("path",), "training": ("truths",),
              "simulation": ("step_from", "confirmed_on")}
 DEEPEST = 3  # most parts of a dotted key, section.sub.key; two more in [variant.NAME]
@@ -199,7 +199,7 @@ def command_line(overrides: Sequence[str], removals: Sequence[str]) -> Layer:
             raise SceneError(f"--set {shortened(override)}: must be section.key=value, or key=value outside sections, "
                              "or section.name.key=value in a nested section; for one variant, "
                              "variant.NAME.section.key=value")
-        if key in OF_FILES:
+        if key in FILE_ONLY_KEYS:
             raise SceneError(f"--set {shortened(override)}: {key} can only be set in a file; "
                              + ("use --unset" if key == "unset" else "write a scene with this base"))
         values[key] = _parsed(value)

@@ -12,13 +12,13 @@ from eddies.scene.terms import DEFAULT_PRESET, GIVES, PRESETS, READS, TERMS, Ter
 from eddies.scene.values import (SceneError, Section, choice, import_paths, number, product_file, read_section,
                                  sections, text, texts)
 
-COME_ALONG = "eddies:"  # the beginning of [model] path for weights of the package
+BUILT_IN_PREFIX = "eddies:"  # the beginning of [model] path for weights of the package
 WEIGHTS = Path(__file__).parents[1] / "weights"
 
 
-def weights_that_come_along() -> list[str]:
+def built_in_weights() -> list[str]:
     """Return the names of the package's trained weights, for [model] path."""
-    return sorted(f"{COME_ALONG}{path.stem}" for path in WEIGHTS.glob("*.h5"))
+    return sorted(f"{BUILT_IN_PREFIX}{path.stem}" for path in WEIGHTS.glob("*.h5"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,9 +45,9 @@ class Model(Section):
         if self.preset is not None and self.terms is not None:
             raise self.problem("preset", f"with terms = {quoted(self.terms)} the list is given twice; remove one of "
                                "the two")
-        if self.path is not None and self.path.startswith(COME_ALONG) and not self.weights_file.is_file():
+        if self.path is not None and self.path.startswith(BUILT_IN_PREFIX) and not self.weights_file.is_file():
             raise self.problem("path", "must be a run directory, a model.h5, or one of "
-                               f"{', '.join(weights_that_come_along())}")
+                               f"{', '.join(built_in_weights())}")
         preset = PRESETS[self.preset or DEFAULT_PRESET] if self.terms is None else {}
         terms = self.terms if self.terms is not None else tuple(preset)
         named = {short_name(term): term for term in terms}
@@ -70,9 +70,9 @@ class Model(Section):
     @property
     def weights_file(self) -> Path | None:
         """The file of the weights that `path` names; None without `path`."""
-        if self.path is None or not self.path.startswith(COME_ALONG):
+        if self.path is None or not self.path.startswith(BUILT_IN_PREFIX):
             return None if self.path is None else product_file(self.path, "train")
-        return WEIGHTS / f"{self.path.removeprefix(COME_ALONG)}.h5"
+        return WEIGHTS / f"{self.path.removeprefix(BUILT_IN_PREFIX)}.h5"
 
     @property
     def reads(self) -> frozenset[str]:

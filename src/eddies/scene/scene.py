@@ -14,13 +14,13 @@ from typing import Any
 from eddies.import_path import search_in
 from eddies.pipeline import STAGES, Stage
 from eddies.scene import checks
-from eddies.scene.layers import (BUILT_IN, OF_FILES, VARIANT, Layer, check_command_line, check_variant, command_line,
-                                 dotted, read_document, with_sections)
+from eddies.scene.layers import (BUILT_IN, FILE_ONLY_KEYS, VARIANT, Layer, check_command_line, check_variant,
+                                 command_line, dotted, read_document, with_sections)
 from eddies.scene.model import Model
 from eddies.scene.rules import quoted
 from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, NEIGHBORS, Eulerian, Flow, Forcing, Horizons, Initial,
                                    Kernel, Reconstruction, Simulation, SpinUp, Time, Tracers, Tracks, Training)
-from eddies.scene.values import (SceneError, Section, choice, import_paths, integer, integers, place, read_section,
+from eddies.scene.values import (SceneError, Section, choice, import_paths, integer, integers, key_name, read_section,
                                  section, sections, text, write_section)
 
 __all__ = ["BOX_LENGTH", "REALISATION", "Scene", "SceneError", "builtin_scenes", "load_scene", "Eulerian", "Flow",
@@ -29,7 +29,7 @@ __all__ = ["BOX_LENGTH", "REALISATION", "Scene", "SceneError", "builtin_scenes",
 
 REALISATION = checks.REALISATION
 # The keys of a scene that a variant cannot change.
-OF_THE_WHOLE = ("name", "base", "realisations", VARIANT)
+SCENE_ONLY_KEYS = ("name", "base", "realisations", VARIANT)
 # The sections that may name classes and functions of the user.
 FOREIGN_IN = ("flow", "initial", "model", "simulation")
 
@@ -73,7 +73,7 @@ class Scene(Section):
         if self.flow is None and self.tracks is None:
             raise SceneError("[flow]: this section is missing; every scene needs it, or [tracks]", "flow")
         for key, problem in self._problems() if self.flow is not None else ():
-            raise SceneError(f"{self._given(key)}: {problem}", key)
+            raise SceneError(f"{self._key_with_value(key)}: {problem}", key)
 
     @classmethod
     def section_name(cls) -> str:
@@ -182,16 +182,16 @@ class Scene(Section):
         return 0.0 if others else self.training.window
 
     @property
-    def injects(self) -> bool:
+    def rollout_is_forced(self) -> bool:
         """Whether particles of the rollout are forced."""
         injection = self.simulation.injection if self.simulation else "none"
         return bool(self.tracers and self.tracers.forced) if injection == "truth" else injection != "none"
 
     @property
-    def resolves(self) -> bool:
+    def needs_resolved_velocity(self) -> bool:
         """Whether a grid resolves the velocity for the model: its terms read that velocity, or particles are forced."""
         return bool(self.model and "resolved" in self.model.reads or self.tracers and self.tracers.forced
-                    or self.injects)
+                    or self.rollout_is_forced)
 
     @property
     def coarse_cells(self) -> int:
@@ -305,9 +305,9 @@ class Scene(Section):
                 own, whole = getattr(variant, within), getattr(self, within)
                 ours, theirs = getattr(own, last, None), getattr(whole, last, None)
                 if ours != theirs and (own and whole or within == "training"):
-                    yield f"{place(last, within)} = {quoted(ours)} where the scene has {quoted(theirs)}: {reason}"
+                    yield f"{key_name(last, within)} = {quoted(ours)} where the scene has {quoted(theirs)}: {reason}"
 
-    def _given(self, key: str) -> str:
+    def _key_with_value(self, key: str) -> str:
         """Return the beginning of an error, a key with its value if it has one, such as "[flow] cells = 8"."""
         within, _, name = key.rpartition(".")
         value: Any = self
@@ -318,8 +318,8 @@ class Scene(Section):
         if isinstance(value, Section) or within == "model" and not hasattr(self.model, name):
             return f"[{key}]"
         if value is None:
-            return place(name, within)
-        return f"{place(name, within)} = {f'{value:g}' if isinstance(value, float) else quoted(value)}"
+            return key_name(name, within)
+        return f"{key_name(name, within)} = {f'{value:g}' if isinstance(value, float) else quoted(value)}"
 
     # ---- text
 
@@ -337,7 +337,7 @@ class Scene(Section):
         """Yield the lines of a variant's table: the keys in which it differs, `key = value`."""
         own, other = (dict(dotted(tomllib.loads("\n".join(write_section(scene)))))
                       for scene in (self.without_variants, self.variant[name]))
-        for key in set(OF_THE_WHOLE) & {*own, *other}:
+        for key in set(SCENE_ONLY_KEYS) & {*own, *other}:
             own.pop(key, None), other.pop(key, None)
         held = Layer(other).keys
         removed = dict.fromkeys(next(part for part in with_sections(key) if part not in held)
@@ -368,7 +368,7 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = (), removals
         variants = {name: Layer.of_table(table) for name, table in _tables_of_variants(document).items()}
         document.pop(VARIANT, None)
         check_command_line(given, variants, existing)
-        scene = read_section(Scene, document, others=(*OF_FILES, VARIANT))
+        scene = read_section(Scene, document, others=(*FILE_ONLY_KEYS, VARIANT))
         return replace(scene, variant={name: _variant(document, name, layer) for name, layer in variants.items()})
     except SceneError as error:
         option = ", --set" if error.key in given.keys else ", --unset" if error.key in removals else ""
@@ -387,11 +387,11 @@ def _variant(document: dict[str, Any], name: str, layer: Layer) -> Scene:
     """The scene of a variant: the document with the variant's changes."""
     try:
         for key in layer.values:
-            if key.partition(".")[0] in OF_THE_WHOLE:
+            if key.partition(".")[0] in SCENE_ONLY_KEYS:
                 raise SceneError(f"{key}: a variant cannot change this key; remove it", key)
         changed = {key: copy.deepcopy(value) for key, value in document.items() if key != "realisations"}
         layer.apply(changed)
-        return read_section(Scene, {**changed, "name": name}, others=OF_FILES)
+        return read_section(Scene, {**changed, "name": name}, others=FILE_ONLY_KEYS)
     except SceneError as error:
         raise SceneError(f'variant "{name}": {error}', error.key) from None
 

@@ -197,7 +197,7 @@ class SpinUp(Section):
 
 
 # The keys in which sets of tracers may differ.
-OF_A_SET = ("particles_per_side", "count", "placement", "seed", "filtered", "filter_width", "field_cells")
+SET_KEYS = ("particles_per_side", "count", "placement", "seed", "filtered", "filter_width", "field_cells")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,15 +256,15 @@ class Tracers(Section):
                 object.__setattr__(self, field.name, getattr(chosen, field.name))
 
     def _set_of(self, name: str, own: Any) -> Tracers:
-        """Make a set from its table or object; the keys outside OF_A_SET are those of this section."""
+        """Make a set from its table or object; the keys outside SET_KEYS are those of this section."""
         if isinstance(own, Tracers):
-            return dataclasses.replace(self, sets={}, set=None, **{key: getattr(own, key) for key in OF_A_SET})
+            return dataclasses.replace(self, sets={}, set=None, **{key: getattr(own, key) for key in SET_KEYS})
         if not isinstance(own, dict):
             raise SceneError(f"tracers.{name}: must be a section; write [tracers.{name}] and its keys below")
         for key in own:
-            if key not in OF_A_SET:
+            if key not in SET_KEYS:
                 raise KeyProblem(f"tracers.{name}", key, ": not a key of a set; the sets share all keys of [tracers] "
-                                 f"except {', '.join(OF_A_SET)}")
+                                 f"except {', '.join(SET_KEYS)}")
         one = {"particles_per_side": None, "count": None} if {"particles_per_side", "count"} & {*own} else {}
         try:
             return dataclasses.replace(self, sets={}, set=None, **{**one, **own})

@@ -36,7 +36,7 @@ class KeyProblem(SceneError):
     """A problem with one key of a section."""
 
     def __init__(self, section: str, key: str, problem: str):
-        super().__init__(f"{place(key, section)}{problem}", f"{section}.{key}" if section else key)
+        super().__init__(f"{key_name(key, section)}{problem}", f"{section}.{key}" if section else key)
         self.section, self._parts = section, (key, problem)
 
     def within(self, section: str) -> "KeyProblem":
@@ -271,7 +271,7 @@ def product_file(path: str, stage: str) -> Path:
     return file if path.endswith(".h5") else file / STAGES[stage].file
 
 
-def place(key: str, section: str) -> str:
+def key_name(key: str, section: str) -> str:
     """Return the name of a key in errors."""
     return f"[{section}] {key}" if section else key
 

@@ -14,13 +14,13 @@ from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.foreseen.ranks import most_ranks
 from eddies.workflows.foreseen.seconds import seconds
 from eddies.workflows.foreseen.storage import disk, in_units, memory, most_disk
-from eddies.workflows.problems import here, problems
+from eddies.workflows.problems import context_here, problems
 from eddies.workflows.variants import rollouts, steps
 
 log = logging.getLogger("eddies")
 
-OF_TURBULENCE = ("velocity_rms", "dissipation_rate", "reynolds_lambda", "turnover_time", "kolmogorov_length",
-                 "kolmogorov_time")
+TURBULENCE_KEYS = ("velocity_rms", "dissipation_rate", "reynolds_lambda", "turnover_time", "kolmogorov_length",
+                   "kolmogorov_time")
 
 
 def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
@@ -49,7 +49,7 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
     """Return all estimates by the keys that docs/check.md describes, None if unknown; all ranks call it."""
     expected, tracers, k_max = estimate(scene), scene.tracers, scene.flow.largest_wavenumber
     rollout_of = {name: estimate(each).rollout for name, each in (scene.variant or {scene.name: scene}).items()}
-    context = here(scene.stages_of_all, scene.directory, comm)
+    context = context_here(scene.stages_of_all, scene.directory, comm)
     (refusals, warnings), limits, turbulence = problems(scene, context), most_ranks(scene), expected.turbulence
     # Scenes by variant (None: shared by all variants) and stage. With realisations a stage has several scenes.
     work: dict[tuple[str | None, str], list[Scene]] = {}
@@ -57,12 +57,12 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
     for step in sorted(planned, key=lambda step: [None, *scene.variant].index(step.variant)):
         for stage in step.stages:
             work.setdefault((step.variant, stage), []).append(step.scene)
-    work[None, "report"] = [place.scene for places in rollouts(scene, scene.directory).values() for place in places]
+    work[None, "report"] = [run.scene for runs in rollouts(scene, scene.directory).values() for run in runs]
     costs = [cost(variant, stage, scenes, comm.size) for (variant, stage), scenes in work.items()]
     return {
         "scene": scene.name, "stages": list(scene.stages_of_all), "cells": scene.flow.cells,
         "largest_wavenumber": k_max,
-        "turbulence": turbulence and {**{name: getattr(turbulence, name) for name in OF_TURBULENCE},
+        "turbulence": turbulence and {**{name: getattr(turbulence, name) for name in TURBULENCE_KEYS},
                                       "kmax_eta": k_max * turbulence.kolmogorov_length},
         "mach_turbulent": expected.mach,
         "particles": tracers and tracers.particles, "spacing": tracers and tracers.spacing,

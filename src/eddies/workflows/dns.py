@@ -30,7 +30,7 @@ from eddies.scene.scene import Scene, SceneError
 from eddies.scene.sections import Forcing, SpinUp
 from eddies.time_stepping import STEPPERS
 from eddies.workflows.ground_truth.flow_run import FlowRun, TracerRun, frame_layout, series_of
-from eddies.workflows.ground_truth.frame_counts import whole_frames
+from eddies.workflows.ground_truth.frame_counts import unfiltered_frames
 from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
 from eddies.workflows.problems import check_span
 from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, stage_fingerprint, stage_provenance
@@ -91,7 +91,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             layout = frame_layout(scene.tracers, fluid.compressible, fluid.grid.cutoff)
             before = () if saved is None else saved.files or [f"../{product.name}"]
             with FrameSegments(comm, guard.checkpoints.path, layout, before) as parts:
-                whole = partial(whole_frames, scene.simulation, scene.training, scene.tracers.field_every)
+                whole = partial(unfiltered_frames, scene.simulation, scene.training, scene.tracers.field_every)
                 tracers = TracerRun(flow, parts, scene.tracers, scene.seed, whole, saved)
                 if tracers.interval > tracers.intervals:
                     raise too_late(guard, f"[tracers] turnovers = {scene.tracers.turnovers:g}")

@@ -45,7 +45,7 @@ log = logging.getLogger("eddies")
 
 TURNOVERS = 0.25  # duration of a short rollout in turnover times
 # Largest share of the error that a step may add, and relative change of the velocity that is always allowed.
-OF_ERROR, OF_VELOCITY = 0.02, 1e-4
+LARGEST_ERROR_SHARE, LEAST_TOLERANCE = 0.02, 1e-4
 # Largest number of halvings of a step.
 HALVINGS = 12
 # Another integrator replaces the best one if it needs less than this share of its time. Measured times vary.
@@ -64,7 +64,7 @@ class Stretch:
 
     def __init__(self, truth: GroundTruth, interval: float, every: int) -> None:
         self.truth, self.turnover = truth, float(truth.reference["eddy_turnover_time"])
-        self.frame = min((frame for frame in truth.at_states if frame > 0), default=1)
+        self.frame = min((frame for frame in truth.state_frames if frame > 0), default=1)
         most = (len(truth.times) - 1 - self.frame) // every
         count = min(max(round(TURNOVERS * self.turnover / interval), 1), most)
         self.stops = np.arange(1, count + 1) * interval
@@ -107,7 +107,7 @@ class Trial:
     @property
     def tolerance(self) -> float:
         """The difference d below which twice the step has converged: e^2 + d^2 = (1.02 e)^2 with the error e."""
-        return max(math.sqrt((1 + OF_ERROR) ** 2 - 1) * self.error, OF_VELOCITY)
+        return max(math.sqrt((1 + LARGEST_ERROR_SHARE) ** 2 - 1) * self.error, LEAST_TOLERANCE)
 
 
 class Ladder:

@@ -37,9 +37,9 @@ LEAST_REYNOLDS = 5.0         # Re_lambda above which large scales transfer energ
 KMAX_ETA = 1.0, 4.0          # the least that resolves the dissipation, and more than any purpose needs
 MOST_STEPS = 10**9           # steps of a flow or rollout, or frames: a quarter of an hour at a microsecond each
 MOST_FORCED = 50             # how many times the energy of a flow the forcing may add in one step
-SILENCE = -40.0              # logarithm of the share of the energy below which only round-off remains
+LOG_NEGLIGIBLE_ENERGY = -40.0  # logarithm of the share of the energy below which only round-off remains
 # Largest turnover time at the release of tracers over the expected one; the least Re_lambda for which it holds.
-LATER, TURBULENT = 3.0, 20.0
+LARGEST_TURNOVER_RATIO, TURBULENT = 3.0, 20.0
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Context:
     free_disk: float = math.inf
 
 
-def here(stages: Sequence[str], directory: Path, comm: Comm) -> Context:
+def context_here(stages: Sequence[str], directory: Path, comm: Comm) -> Context:
     """Return the context of stages in a run directory on this machine; all ranks call it."""
     place = next(path for path in (directory, *directory.parents) if path.is_dir())
     free = on_first_rank(comm, lambda: shutil.disk_usage(place).free)
@@ -86,7 +86,8 @@ def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
     doubts: dict[str, list[str]] = {}
     for step in planned:
         refused |= dict.fromkeys(f"{step.scene.name}: {problem}" for problem in _infeasible(step, comm, made))
-        refused |= dict.fromkeys([*place_problems(step.stages, comm, step.directory), *_unfit_files(step, comm, made)])
+        refused |= dict.fromkeys(directory_problems(step.stages, comm, step.directory))
+        refused |= dict.fromkeys(_unfit_files(step, comm, made))
         for doubt in _warnings(step, made):
             doubts.setdefault(doubt, []).append(step.variant or "")
         for stage in step.stages:
@@ -95,7 +96,7 @@ def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
                 doubts[f"{stage}: {on_node} ranks with about {in_units(size)} each need more than the "
                        f"{in_units(context.memory)} of memory here; take more nodes, or fewer cells or particles"] = []
     if "report" in context.stages:
-        refused |= dict.fromkeys(place_problems(("report",), comm, context.directory))
+        refused |= dict.fromkeys(directory_problems(("report",), comm, context.directory))
     needed = most_disk(disk(step.scene, stage) for step in planned for stage in step.stages)
     if scene.sets and scene.kernel is not None and not scene.variant:
         doubts[f"[tracers] set: is absent, so that only the ground truths of {', '.join(scene.sets)} are made; "
@@ -154,7 +155,7 @@ def _decay(flow: Flow, tracers: Tracers, turbulence: Turbulence) -> Iterator[str
     """A flow that viscosity stops before the tracers end."""
     time = tracers.turnovers * turbulence.turnover_time
     exponent = -2 * flow.viscosity * time  # of the largest modes, |k| = 1
-    if exponent < SILENCE and not tracers.forced:
+    if exponent < LOG_NEGLIGIBLE_ENERGY and not tracers.forced:
         yield (f"[flow] viscosity = {flow.viscosity:g}: Re_lambda would be {turbulence.reynolds_lambda:.1g}, and less "
                f"than exp({exponent:.3g}) of the flow's energy would remain after [tracers] turnovers = "
                f"{tracers.turnovers:g}, a time of {time:.3g}; lower viscosity or turnovers")
@@ -181,7 +182,7 @@ def _too_many(key: str, value: float | str, step: float, span: float) -> Iterato
 
 def _too_few_frames(tracers: Tracers, turnover_time: float, check: Callable[[int], None]) -> Iterator[str]:
     """Too few frames for a `check` of their number, even with the longest possible turnover time."""
-    frames = max(math.ceil(LATER * tracers.turnovers * turnover_time / tracers.frame_interval), 1) + 1
+    frames = max(math.ceil(LARGEST_TURNOVER_RATIO * tracers.turnovers * turnover_time / tracers.frame_interval), 1) + 1
     if frames <= MOST_STEPS:
         try:
             check(frames)
@@ -192,12 +193,12 @@ def _too_few_frames(tracers: Tracers, turnover_time: float, check: Callable[[int
 def _large_files(needs: Mapping[str, Disk], ranks: int) -> Iterator[str]:
     """Products that are too large for rank 0 to write for all."""
     for stage, needed in needs.items():
-        if (size := (needed.kept or 0.0) - needed.beside) > LARGEST_BYTES:
+        if (size := (needed.kept or 0.0) - needed.other_files) > LARGEST_BYTES:
             yield (f"{STAGES[stage].file}: this h5py is built without MPI, so rank 0 writes for {ranks} ranks, at most "
                    f"{in_units(LARGEST_BYTES)} a file, but this file will take {in_units(size)}; {REMEDY}")
 
 
-def place_problems(stages: Sequence[str], comm: Comm, directory: Path) -> list[str]:
+def directory_problems(stages: Sequence[str], comm: Comm, directory: Path) -> list[str]:
     """Problems of a run directory: it cannot be used, or a file or directory in it blocks the name of a product."""
     def look() -> list[str]:
         if directory.is_dir() and not os.access(directory, os.W_OK | os.X_OK):
@@ -262,8 +263,8 @@ def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
         yield from untrained_terms(model, training)
     if "simulate" in stages:
         if "model" in simulation.needs and not math.isinf(simulation.longest_step):
-            speed = expected.rms_speed
-            yield from rollout_steps(simulation, expected.allowed_step if scene.injects else None, model, StepUnits(
+            speed, allowed = expected.rms_speed, expected.allowed_step if scene.rollout_is_forced else None
+            yield from rollout_steps(simulation, allowed, model, StepUnits(
                 radius=scene.interaction_radius, filter_width=tracers.filter_width, sound_speed=scene.flow.sound_speed,
                 velocity=None if speed is None else speed / math.sqrt(3), scheme=simulation.scheme))
         yield from beyond_truth(simulation, tracers, scene.seen_in(step.holder("dns")))

@@ -15,7 +15,7 @@ from eddies.workflows.run_directory.work import changed_settings, of_other_setti
 Provenance = Mapping[str, Any]
 
 # Columns of a model's training that every step has; others are NaN in steps that do not compute them.
-OF_EVERY_STEP = "step", "phase", "seconds", "loss", "learning_rate", "gradient_norm"
+COLUMNS_OF_ALL_STEPS = "step", "phase", "seconds", "loss", "learning_rate", "gradient_norm"
 MOST_NAMED = 4  # places that a sentence names
 
 
@@ -30,7 +30,7 @@ def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
             named = " and from ".join(_other(needed, origin, present) for needed, present in others.items())
             or_else = ("note that the report compares different flows or models" if any(others.values()) else
                        "restore the missing file")
-            found.append(f"{_made(kind, origin)} was made from {named}: {_make_again(kind)}, or {or_else}")
+            found.append(f"{_made(kind, origin)} was made from {named}: {_remedy_for(kind)}, or {or_else}")
     return found
 
 
@@ -40,7 +40,7 @@ def changed_truths(origin: Provenance) -> list[str]:
     `origin` is the provenance of the model. Removed ground truths are skipped.
     """
     now = {path: product_provenance(path).get("id") for path in origin.get("truths", {})}
-    return [f"{_made('model', origin)} was trained on {path}, which has changed since then; {_make_again('model')}, or "
+    return [f"{_made('model', origin)} was trained on {path}, which has changed since then; {_remedy_for('model')}, or "
             "note that the model has learned from another flow"
             for path, known in origin.get("truths", {}).items() if now[path] not in (None, known)]
 
@@ -52,7 +52,7 @@ def not_finite(file: File, kind: str) -> str:
     for place, frame, values in stored_numbers(file):
         table, _, column = place.partition("/")
         # A training does not compute every number in every step, and a search for a step has trials that failed.
-        gaps = kind == "step" or kind == "model" and table == "history" and column not in OF_EVERY_STEP
+        gaps = kind == "step" or kind == "model" and table == "history" and column not in COLUMNS_OF_ALL_STEPS
         # Scales without viscosity, and the sound speed of an incompressible fluid, are infinite.
         wrong = np.isnan(values) if kind == "ground_truth" else ~np.isfinite(values) & (not gaps)
         if wrong.any():
@@ -62,11 +62,11 @@ def not_finite(file: File, kind: str) -> str:
         return ""
     more = f" and {len(places) - MOST_NAMED} more" if len(places) > MOST_NAMED else ""
     status = read_attributes(file, "rollout")["status"] if kind == "rollout" else "complete"
-    remedy = _make_again(kind) if status == "complete" else f"the rollout {status}"
+    remedy = _remedy_for(kind) if status == "complete" else f"the rollout {status}"
     return f"{MAKER_OF[kind].file} holds numbers that are not finite ({'; '.join(places[:MOST_NAMED])}{more}): {remedy}"
 
 
-def _make_again(kind: str) -> str:
+def _remedy_for(kind: str) -> str:
     return f"remove {MAKER_OF[kind].file} and run `eddies {MAKER_OF[kind].name}` again"
 
 

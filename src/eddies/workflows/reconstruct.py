@@ -186,7 +186,7 @@ class ReconstructionRun:
         if len(self.methods) > 1:
             known, apart = split(particles, self.settings.holdout)
             row["validation_error"] = validation_error(self.solver, self.methods[1].of(known, time), known, apart)
-        if self.source.truth is not None and frame in self.source.truth.at_fields:
+        if self.source.truth is not None and frame in self.source.truth.field_frames:
             self.of_fields.append({"time": time, **errors_of(modes, mean, self.tracers, self.grid, self.source.truth,
                                                              frame)})
         self.errors.append(row)
@@ -348,7 +348,7 @@ def errors_of(modes: Tensor, mean: np.ndarray, tracers: Tracers, grid: FourierGr
     """Normalised L2 errors of the filtered velocity and its gradient at a frame with a field in the ground truth."""
     slab = SlabDecomposition(grid.decomposition.comm, BOX_LENGTH, truth.fields.cells)
     target = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
-    exact = truth.planes(truth.fields, truth.at_fields.index(frame), "velocity", slab)
+    exact = truth.planes(truth.fields, truth.field_frames.index(frame), "velocity", slab)
     given = modes if tracers.filtered else modes * grid.filter_transfer(tracers.filter_width)
     found = {"velocity": target.backward(regrid(grid.spectral, target, as_numpy(given.resolve_conj())))
              + mean[:, None, None, None]}

@@ -38,12 +38,12 @@ from eddies.report import (figures, forced, ground_truth, kernel, model, reconst
 from eddies.report import variants as table_of_variants
 from eddies.report.page import Metric, RunRecord, Section, shown, write_page
 from eddies.scene.scene import Scene, SceneError, load_scene
-from eddies.workflows.problems import place_problems
+from eddies.workflows.problems import directory_problems
 from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite
 from eddies.workflows.run_directory.work import read_stage_seconds
 from eddies.workflows.variant_rows import (COLUMNS, ROLLOUT, add_break_even, machine, notes, numbers, row,
                                            simulation_seconds)
-from eddies.workflows.variants import Place, rollouts
+from eddies.workflows.variants import RolloutRun, rollouts
 
 if TYPE_CHECKING:
     from eddies.analysis.rollout import Rollout
@@ -109,7 +109,7 @@ class Run:
 
     directory: Path
     scene: Scene | None
-    places: Mapping[str, Sequence[Place]]
+    runs: Mapping[str, Sequence[RolloutRun]]
     pages: Mapping[str, Path]
     output: Path | None = None
 
@@ -117,15 +117,15 @@ class Run:
     def of(cls, directory: Path, first: Sequence[str] = (), output: Path | None = None) -> Run:
         """Read a run directory. The main page shows the first variant of `first` that was run, or else
         the first of all variants that was run."""
-        scene, places = None, {}
+        scene, runs = None, {}
         with contextlib.suppress(SceneError):
             scene = load_scene(directory / "scene.toml")
         if scene is not None:
             scene.check_variants(first)
-            places = rollouts(scene, directory) if scene.simulation is not None else {}
-        ran = {name: where[0].directory for name, where in places.items() if _has_rollout(where[0].directory)}
+            runs = rollouts(scene, directory) if scene.simulation is not None else {}
+        ran = {name: where[0].directory for name, where in runs.items() if _has_rollout(where[0].directory)}
         main = next((name for name in (*first, *ran) if name in ran), "")
-        return cls(directory, scene, places, {main: ran.get(main, directory), **ran}, output)
+        return cls(directory, scene, runs, {main: ran.get(main, directory), **ran}, output)
 
     @property
     def main(self) -> str:
@@ -134,8 +134,8 @@ class Run:
 
     def measured(self, name: str) -> list[Path]:
         """Directories of the rollouts of a variant."""
-        places = [place.directory for place in self.places[name]] if name else [self.directory]
-        return list(filter(_has_rollout, places))
+        directories = [run.directory for run in self.runs[name]] if name else [self.directory]
+        return list(filter(_has_rollout, directories))
 
     def report_of(self, page: Path) -> Path:
         """The directory of the report about a run directory."""
@@ -166,7 +166,7 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: S
     SceneError if `variants` names an unknown variant; Stopped, before any page is written, when `stop` asks for it.
     """
     directory, stop = Path(directory), stop or StopRequest(comm)
-    for problem in place_problems(("report",), comm, directory) if output is None else ():
+    for problem in directory_problems(("report",), comm, directory) if output is None else ():
         raise SceneError(problem)
     stored = in_files(comm, directory, lambda: Run.of(directory, variants, output))
     alone = comm.Split(comm.rank)
@@ -200,7 +200,7 @@ def _make(stored: Run, comm: Comm, alone: Comm, stop: StopRequest,
     All ranks measure each rollout together, for the rank that makes its page and its row. They make the pages in
     rounds. Raises Stopped, after a variant's rollouts are measured or after a round, when `stop` asks for it.
     """
-    names = list(stored.pages) + [name for name in stored.places if name not in stored.pages]
+    names = list(stored.pages) + [name for name in stored.runs if name not in stored.pages]
     (makers, rounds), made, rows, truths, scanned = _makers(names, comm.size), {}, {}, {}, {}
     with ExitStack() as files:
         measured: dict[str, list[MeasuredRollout]] = {name: [] for name in names}
@@ -221,9 +221,9 @@ def _make(stored: Run, comm: Comm, alone: Comm, stop: StopRequest,
                 if draw:
                     page.draw(page.sections)
             if stored.main:
-                places = stored.places[name]
-                realised = [numbers(each) for each in measured[name]] if len(measured[name]) == len(places) else []
-                rows[name] = row(stored.scene, name, places, realised, alone)
+                runs = stored.runs[name]
+                realised = [numbers(each) for each in measured[name]] if len(measured[name]) == len(runs) else []
+                rows[name] = row(stored.scene, name, runs, realised, alone)
             for each in measured[name]:
                 each.forget()
 
@@ -418,7 +418,7 @@ def _table_section(stored: Run, page: Page, rows: Mapping[str, Row]
     """Return the section on all variants with its table; nothing if no variant was run."""
     if not stored.main:
         return [], None
-    of_variants = [rows[name] for name in stored.places]
+    of_variants = [rows[name] for name in stored.runs]
     simulation = simulation_seconds(stored.scene, of_variants, page.simulation_seconds)
     add_break_even(of_variants, simulation)
     table = table_of_variants.ErrorAgainstTime(of_variants, stored.main, simulation)

@@ -41,7 +41,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                   " of the rollout")
     with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as truth_file, torch.no_grad():
         truth = GroundTruth(truth_file, slab, device)
-        start = rollout_start(settings, scene.tracers, scene.seen_in(directory), len(truth.times), truth.at_fields)
+        start = rollout_start(settings, scene.tracers, scene.seen_in(directory), len(truth.times), truth.field_frames)
         step = None
         if (path := step_path(settings, directory)) is not None:
             found, _ = read_found_step(path, comm)

@@ -11,7 +11,7 @@ from eddies.clock import duration
 from eddies.errors import UserError
 from eddies.io.checkpoint import checkpoints_in
 from eddies.io.checksums import ATTRIBUTE, find_damage, open_to_read
-from eddies.io.errors import ProductError, make_again
+from eddies.io.errors import ProductError, remedy_for
 from eddies.io.hdf5 import in_files
 from eddies.io.provenance import product_fingerprint, product_provenance
 from eddies.io.run_lock import find_lock
@@ -54,7 +54,7 @@ def _complaint(comm: Comm, path: Path) -> str | None:
         damage = find_damage(comm, path)
     except ProductError as error:
         return str(error)
-    return damage and f"{damage}; {make_again(path.stem)}"
+    return damage and f"{damage}; {remedy_for(path.stem)}"
 
 
 def products_in(directory: Path) -> list[Path]:
@@ -112,8 +112,9 @@ def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
         own, text = partial(stage_fingerprint, step.scene), step.scene.to_toml()
         for name in [name for name in step.stages if name in step.scene.stages]:
             state = stage_state(STAGES[name], step.directory, own(name), own(name, DURATION_KEYS.get(name, ())), text)
-            lacking = [path.parent.name for path, mark in (set_files(step.scene) if name == "dns" else {}).items()
-                       if product_fingerprint(step.directory / path) != mark]
+            sets = set_files(step.scene) if name == "dns" else {}
+            lacking = [path.parent.name for path, fingerprint in sets.items()
+                       if product_fingerprint(step.directory / path) != fingerprint]
             if lacking and state.startswith("complete"):
                 state = f"lacks the ground truth of {', '.join(lacking)}"
             rows.append((prefix + name, seconds.get(name), state))

@@ -42,8 +42,8 @@ log = logging.getLogger("eddies")
 
 RUN = {"dns": dns.run, "train-kernel": train_kernel.run, "reconstruct": reconstruct.run, "train": train.run,
        "find-step": find_step.run, "simulate": simulate.run}
-FEW = 4                      # steps of a training, and intervals of a rollout
-A_MOMENT = 1e-9              # turnovers of a spin-up or ground truth of as few steps as possible
+FEW_STEPS = 4                # steps of a training, and intervals of a rollout
+LEAST_TURNOVERS = 1e-9       # turnovers of a spin-up or ground truth of as few steps as possible
 
 
 class StepTimes(StopRequest):
@@ -144,7 +144,7 @@ def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
     elif stage == "train-kernel":
         number = 2 * whole.kernel.steps
     else:
-        number = expected.rollout and round(taken * expected.rollout.intervals / FEW)
+        number = expected.rollout and round(taken * expected.rollout.intervals / FEW_STEPS)
     return seconds + max((number or 0) - taken, 0) * step, step, number
 
 
@@ -167,7 +167,7 @@ def rest_of_training(definition: ModelDefinition, few: Training, frames: int, di
             stop.check()
             optimizer = Adam(comm, parameters, phase.steps, *phase.rates)
             step = min(elapsed(comm, lambda: phase.take(optimizer, index))
-                       for index in range(min(2 * FEW, phase.steps)))
+                       for index in range(min(2 * FEW_STEPS, phase.steps)))
             stepping, number = stepping + phase.steps * step, number + phase.steps
             seconds += (phase.steps // phase.validate_every + 1) * elapsed(comm, phase.validate)
     return seconds + stepping, number, stepping / max(number, 1)
@@ -182,12 +182,12 @@ def shortened(scene: Scene, turnover: float | None) -> Scene:
     few, tracers, simulation, training = scene.without_variants, scene.tracers, scene.simulation, scene.training
     if tracers is None:
         step = estimate(scene).step or few.time.max_step
-        return replace(few, time=replace(few.time, duration=2 * FEW * step))
+        return replace(few, time=replace(few.time, duration=2 * FEW_STEPS * step))
     changed: dict[str, Any] = {}
     if scene.spin_up:
-        changed["spin_up"] = replace(scene.spin_up, turnovers=A_MOMENT, stationary=None)
+        changed["spin_up"] = replace(scene.spin_up, turnovers=LEAST_TURNOVERS, stationary=None)
     if scene.kernel:
-        changed["kernel"] = replace(scene.kernel, steps=FEW)
+        changed["kernel"] = replace(scene.kernel, steps=FEW_STEPS)
     longest = between = 0        # frames of the longest horizon, and of an interval of the rollout
     if training:
         longest = max(training.horizons.frames) if training.horizons else 0
@@ -195,10 +195,10 @@ def shortened(scene: Scene, turnover: float | None) -> Scene:
         changed["training"] = replace(training, window=1.0, frames=frames)
     if simulation:
         between = round(simulation.frame_interval / tracers.frame_interval)
-        turnovers = (FEW - 0.5) * simulation.frame_interval / turnover if turnover else simulation.turnovers
+        turnovers = (FEW_STEPS - 0.5) * simulation.frame_interval / turnover if turnover else simulation.turnovers
         changed["simulation"] = replace(simulation, turnovers=turnovers, start=0.0)
-    span = (FEW + max(2 * longest, between) - 0.5) * tracers.frame_interval
-    changed["tracers"] = replace(tracers, turnovers=span / turnover if turnover else A_MOMENT, field_every=1)
+    span = (FEW_STEPS + max(2 * longest, between) - 0.5) * tracers.frame_interval
+    changed["tracers"] = replace(tracers, turnovers=span / turnover if turnover else LEAST_TURNOVERS, field_every=1)
     return replace(few, variant=variants, **changed)
 
 

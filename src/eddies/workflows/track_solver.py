@@ -32,15 +32,15 @@ def best_solver(particles: ParticleSet, make: Callable[[float], ResolvedVelocity
     none of which is known well. Weights are tried in descending order until the error rises by a fiftieth. If there
     are too few particles to leave one out, the default weight is taken, and the error is NaN. Collective.
     """
-    known, apart = split(particles, share)
+    known, held_out = split(particles, share)
     default = make(WEIGHT)
-    if not global_sum(default.grid.decomposition.comm, len(apart.id)):
+    if not global_sum(default.grid.decomposition.comm, len(held_out.id)):
         return default, WEIGHT, math.nan
     errors: dict[float, float] = {}
     for weight in WEIGHTS.tolist():
         solver = make(weight)
         with torch.no_grad():
-            errors[weight] = validation_error(solver, solver.of(known).velocity, known, apart)
+            errors[weight] = validation_error(solver, solver.of(known).velocity, known, held_out)
         if errors[weight] > RISE * min(errors.values()):
             break
     best = min(errors, key=errors.__getitem__)
@@ -49,18 +49,18 @@ def best_solver(particles: ParticleSet, make: Callable[[float], ResolvedVelocity
 
 def split(particles: ParticleSet, share: float) -> tuple[ParticleSet, ParticleSet]:
     """Split particles by id into the known ones and a `share` that is left out; the same on any number of ranks."""
-    apart = particles.id * KNUTH % 2**32 < int(share * 2**32)
+    held_out = particles.id * KNUTH % 2**32 < int(share * 2**32)
     known, held = (ParticleSet(particles.id[rows], particles.position[rows], particles.velocity[rows])
-                   for rows in (~apart, apart))
+                   for rows in (~held_out, held_out))
     return known, held
 
 
-def validation_error(solver: ResolvedVelocity, modes: torch.Tensor, known: ParticleSet, apart: ParticleSet) -> float:
+def validation_error(solver: ResolvedVelocity, modes: torch.Tensor, known: ParticleSet, held_out: ParticleSet) -> float:
     """Normalised L2 error of modes at particles that were left out. The modes are relative to the mean velocity of the
     `known` ones. NaN if none was left out. Collective."""
     comm = solver.grid.decomposition.comm
-    wanted = apart.velocity - mean_over_ranks(comm, known.velocity)
-    missed = solver.grid.at(modes, solver.grid.points(apart.position)) - wanted
+    wanted = held_out.velocity - mean_over_ranks(comm, known.velocity)
+    missed = solver.grid.at(modes, solver.grid.points(held_out.position)) - wanted
     square, whole = global_sum(comm, np.array([float(missed.square().sum()), float(wanted.square().sum())]))
     return math.sqrt(square / whole) if whole > 0 else math.nan
 

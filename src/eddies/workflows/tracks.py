@@ -29,7 +29,7 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Flow, Scene, SceneError, Tracers
 from eddies.scene.sections import Eulerian, Initial, Tracks
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
-from eddies.workflows.ground_truth.track_frames import TrackFrames, measured
+from eddies.workflows.ground_truth.track_frames import TrackFrames, read_measured
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 from eddies.workflows.track_solver import NO_FILTER, best_solver, particles_on, solver_of
 
@@ -96,7 +96,7 @@ def _unfit(scene: Scene) -> Iterator[str]:
 
 
 def _sections_of(settings: Tracks, learned: bool) -> dict[str, Flow | Tracers]:
-    tracks = measured(settings)
+    tracks = read_measured(settings)
     if learned and tracks.complete < LEAST_TRACKS:
         raise SceneError(f"{settings.file}: only {tracks.complete} of {tracks.about['in_file']} tracks are in all "
                          f"{len(tracks.times)} frames, but a model needs {LEAST_TRACKS}; give a part of the file with "

@@ -105,7 +105,7 @@ def load_sample(truth: GroundTruth, index: int, support: float) -> KernelSample:
     velocity = truth.planes(truth.fields, index, "velocity", slab)
     grid = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
     derivatives = np.stack([grid.backward(grid.gradient(component)) for component in grid.forward(velocity)])
-    columns = migrate(slab, truth.block(truth.at_fields[index], ("position", "velocity")))
+    columns = migrate(slab, truth.block(truth.field_frames[index], ("position", "velocity")))
     by_point = [torch.from_numpy(np.ascontiguousarray(np.moveaxis(values.reshape(*values.shape[:-3], -1), -1, 0)))
                 for values in (velocity, derivatives)]
     position, own_velocity = (torch.from_numpy(columns[name]) for name in ("position", "velocity"))

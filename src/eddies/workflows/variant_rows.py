@@ -23,7 +23,7 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import FAILURE, read_found_step, step_path
-from eddies.workflows.variants import Place
+from eddies.workflows.variants import RolloutRun
 
 if TYPE_CHECKING:
     from eddies.workflows.rollout.measured import MeasuredRollout  # needs torch
@@ -45,11 +45,11 @@ MODEL, ROLLOUT = STAGES["train"].file, STAGES["simulate"].file
 _kernel_of = partial(stage_fingerprint, stage="train-kernel")
 
 
-def row(scene: Scene, name: str, places: Sequence[Place], realised: Sequence[Mapping[str, Any]],
+def row(scene: Scene, name: str, runs: Sequence[RolloutRun], realised: Sequence[Mapping[str, Any]],
         alone: Comm) -> dict[str, Any]:
     """Return the row of a variant, or of a scene without variants, by COLUMNS; a missing number is None.
 
-    realised: `numbers` of the rollouts in `places`, or nothing if one of them is missing. Times are in turnovers T,
+    realised: `numbers` of the rollouts in `runs`, or nothing if one of them is missing. Times are in turnovers T,
     `wall_seconds` and `core_seconds` are those of one turnover.
     """
     variant = scene.variant.get(name, scene)
@@ -58,18 +58,18 @@ def row(scene: Scene, name: str, places: Sequence[Place], realised: Sequence[Map
               "kind": variant.simulation.title, "on_grid": variant.simulation.on_grid,
               "settings": "; ".join(scene.differences(name)) if scene.variant else ""}
     if realised:
-        found |= together(realised)
-        first, own = places[0].directory, places[0].scene
+        found |= combined(realised)
+        first, own = runs[0].directory, runs[0].scene
         found |= before(first / MODEL if own.needs_model else None, step_path(own.simulation, first), alone)
         if _kernel_of(variant) != _kernel_of(_measure_of(scene)):
             found |= dict.fromkeys(THROUGH_KERNEL)
     else:
-        found["status"] = why_not(next(place.directory for place in places
-                                       if not (place.directory / ROLLOUT).exists()))
+        found["status"] = missing_reason(next(run.directory for run in runs
+                                              if not (run.directory / ROLLOUT).exists()))
     return {key: finite(value) for key, value in found.items()}
 
 
-def why_not(directory: Path) -> str:
+def missing_reason(directory: Path) -> str:
     """Return why there is no rollout."""
     for path in (directory / FAILURE, directory.parent / FAILURE):
         if path.is_file():
@@ -77,7 +77,7 @@ def why_not(directory: Path) -> str:
     return "not run"
 
 
-def together(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def combined(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Combine the numbers of several realisations.
 
     Errors become a mean and a standard deviation, if all realisations have them. Times become a median, with the widest

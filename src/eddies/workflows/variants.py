@@ -74,14 +74,14 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Place:
+class RolloutRun:
     """A rollout of a variant: its scene, and the run directory with all products that it needs."""
 
     scene: Scene
     directory: Path
 
 
-def rollouts(scene: Scene, directory: Path) -> dict[str, list[Place]]:
+def rollouts(scene: Scene, directory: Path) -> dict[str, list[RolloutRun]]:
     """The rollouts of each variant, one for each realisation. A scene without variants counts as one variant, unless it
     has sets of tracers."""
     found = {}
@@ -90,7 +90,7 @@ def rollouts(scene: Scene, directory: Path) -> dict[str, list[Place]]:
         if own.sets:
             continue
         if scene.realisations is None:
-            found[name or scene.name] = [Place(own, where)]
+            found[name or scene.name] = [RolloutRun(own, where)]
             continue
         model = own.model if "train" in own.stages else None
         if model is not None and model.path is None:
@@ -98,8 +98,8 @@ def rollouts(scene: Scene, directory: Path) -> dict[str, list[Place]]:
         step_from = str(where) if own.simulation.finds_step else own.simulation.step_from
         simulation = replace(own.simulation, start=0.0, step_from=step_from, confirmed_on=None)
         found[name or scene.name] = [
-            Place(replace(own.realisation(seed), model=model, training=None, simulation=simulation),
-                  where / f"{REALISATION}{seed}") for seed in scene.realisations]
+            RolloutRun(replace(own.realisation(seed), model=model, training=None, simulation=simulation),
+                       where / f"{REALISATION}{seed}") for seed in scene.realisations]
     return found
 
 
@@ -114,38 +114,38 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
         return [Step(scene, making, directory)] if making else []
     whole, seeds = scene.without_variants, scene.realisations or ()
     # Directory of each ground truth that a variant may use, below that of the scene or of a realisation.
-    truths = {mark: path.parent for path, mark in set_files(whole).items()} or {stage_fingerprint(whole, "dns"): Path()}
+    truths = ({fingerprint: path.parent for path, fingerprint in set_files(whole).items()}
+              or {stage_fingerprint(whole, "dns"): Path()})
     realisations = tuple(directory / f"{REALISATION}{seed}" for seed in seeds)
-    places = rollouts(scene, directory)
+    runs = rollouts(scene, directory)
     chosen: Sequence[str | None] = [name for name in [*names] or [*scene.variant] or [None]
-                                    if (name or scene.name) in places]
+                                    if (name or scene.name) in runs]
     used = [scene.variant[name].tracers if name else whole.tracers for name in chosen]
-    planned: list[tuple[str | None, Place, Sequence[str]]] = []
+    planned: list[tuple[str | None, Scene, Path, Sequence[str]]] = []
     # The scene of a further ground truth: rollouts start at its beginning, and no model is trained.
     simulation = whole.simulation and replace(whole.simulation, method="none", start=0.0, confirmed_on=None)
     truth = replace(whole, model=None, training=None, eulerian=None, simulation=simulation)
-    for own, where in [(whole, directory), *((truth.realisation(seed), place)
-                                             for seed, place in zip(seeds, realisations))]:
-        planned.append((None, Place(own, where), SHARED))
+    for own, where in [(whole, directory), *((truth.realisation(seed), path)
+                                             for seed, path in zip(seeds, realisations))]:
+        planned.append((None, own, where, SHARED))
         for name, tracers in own.sets.items():
             if tracers in used:  # the kernel is beside the ground truth of the set
-                planned.append((None, Place(replace(own, tracers=tracers), where / name), ("train-kernel",)))
+                planned.append((None, replace(own, tracers=tracers), where / name, ("train-kernel",)))
     for name in chosen:
         own = scene.variant[name] if name else whole
         if seeds and own.simulation.finds_step and own.simulation.confirmed_on is None and (
                 (below := truths.get(stage_fingerprint(own, "dns"))) is not None):
             # A step must converge on all realisations, unless these are of another flow than the variant's.
-            confirmed_on = tuple(str(place / below) for place in realisations)
+            confirmed_on = tuple(str(path / below) for path in realisations)
             own = replace(own, simulation=replace(own.simulation, confirmed_on=confirmed_on))
         trained = ("train",) if not seeds or own.model is not None and own.model.path is None else ()
-        planned.append((name, Place(own, directory / (name or "")), (*SHARED, *trained, "find-step")))
-    for together in zip(*(places[name or scene.name] for name in chosen)):
-        planned += [(name, place, (*SHARED, *(("train",) if seeds else ()), "simulate"))
-                    for name, place in zip(chosen, together)]
+        planned.append((name, own, directory / (name or ""), (*SHARED, *trained, "find-step")))
+    for together in zip(*(runs[name or scene.name] for name in chosen)):
+        planned += [(name, run.scene, run.directory, (*SHARED, *(("train",) if seeds else ()), "simulate"))
+                    for name, run in zip(chosen, together)]
     found: list[Step] = []
     made: dict[tuple[str, str], Path] = {}
-    for name, place, possible in planned:
-        own, where = place.scene, place.directory
+    for name, own, where, possible in planned:
         working, links = [], {}
         for stage in [stage for stage in STAGES if stage in own.stages and stage in MAKING]:
             key = stage, stage_fingerprint(own, stage)
@@ -158,7 +158,8 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
             elif stage in possible and holder is None:
                 made[key] = where
                 if stage == "dns":
-                    made |= {(stage, mark): (where / path).parent for path, mark in set_files(own).items()}
+                    made |= {(stage, fingerprint): (where / path).parent
+                             for path, fingerprint in set_files(own).items()}
                 working += [stage] if stage in stages else []
         if working:
             found.append(Step(own, tuple(working), where, name, links))

@@ -14,7 +14,7 @@ from eddies.workflows.foreseen.numbers import estimate, rollout_in
 from eddies.workflows.foreseen.seconds import START, seconds
 from eddies.workflows.foreseen.storage import (FLOW_PROCESS, TORCH_PROCESS, Disk, disk, flow_memory, memory, most_disk,
                                                rollout_bytes, trajectory_bytes)
-from eddies.workflows.ground_truth.frame_counts import whole_frames
+from eddies.workflows.ground_truth.frame_counts import unfiltered_frames
 from eddies.workflows.problems import _large_files
 from tests.small_scene import one_model
 
@@ -104,7 +104,7 @@ def test_runs_take_the_steps_and_bytes_that_are_expected(comm, folder, overrides
     with h5py.File(folder / "ground_truth.h5") as file:
         frames = len(file["particles/tracers/time"])
     flow, tracers = scene.flow, scene.tracers
-    whole = len(whole_frames(scene.simulation, scene.training, tracers.field_every, frames))
+    whole = len(unfiltered_frames(scene.simulation, scene.training, tracers.field_every, frames))
     # A third of files this small is headers and text.
     for name, size in (("rollout", rollout_bytes(tracers.particles, rollout.intervals + 1)),
                        ("ground_truth", trajectory_bytes(flow, tracers, frames, whole))):
@@ -155,13 +155,13 @@ def test_memory_falls_with_the_ranks_and_grows_with_the_frames():
 
 def test_the_disk_of_the_worst_moment():
     assert most_disk([Disk(4.0, 2.0), Disk(None, 9.0), Disk(3.0)]) == 13 and most_disk([Disk(2.0)] * 3) == 6
-    kept, scratch, beside = disk(load_scene("taylor-green", ["flow.cells=256"]), "dns")
-    assert kept - beside > 4 * 3 * 256**3 and scratch >= beside > 256**3
+    kept, scratch, other_files = disk(load_scene("taylor-green", ["flow.cells=256"]), "dns")
+    assert kept - other_files > 4 * 3 * 256**3 and scratch >= other_files > 256**3
 
 
 def test_the_last_state_is_no_part_of_the_largest_product():
     """A limit of 4 GB a file, where rank 0 writes for all."""
-    sizes = {"all in the product": Disk(5e9), "a state beside it": Disk(5e9, beside=2e9)}
+    sizes = {"all in the product": Disk(5e9), "a state beside it": Disk(5e9, other_files=2e9)}
     assert [name for name, needed in sizes.items() if [*_large_files({"dns": needed}, 2)]] == ["all in the product"]
 
 

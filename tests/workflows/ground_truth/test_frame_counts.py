@@ -7,7 +7,7 @@ import pytest
 
 from eddies.scene.scene import Horizons, SceneError, load_scene
 from eddies.workflows.ground_truth.frame_counts import (check_frames, last_trained_on, rollout_start, trained_frames,
-                                                        whole_frames)
+                                                        unfiltered_frames)
 from tests.small_scene import TINY
 
 FRAMES = 101
@@ -19,8 +19,8 @@ def test_the_whole_flow_is_stored_where_rollouts_start(changes):
     every = scene.tracers.field_every
     seen = scene.seen_in(scene.directory)
     start = rollout_start(scene.simulation, scene.tracers, seen, FRAMES, range(0, FRAMES, every))
-    assert whole_frames(scene.simulation, scene.training, every, FRAMES) == {every, start}
-    assert whole_frames(None, None, every, FRAMES) == set()
+    assert unfiltered_frames(scene.simulation, scene.training, every, FRAMES) == {every, start}
+    assert unfiltered_frames(None, None, every, FRAMES) == set()
 
 
 @pytest.mark.parametrize("window, horizons, held_out", [
@@ -48,10 +48,10 @@ def test_the_field_loss_uses_frames_with_a_field_one_frame_later():
     (12, 6), (13, 6), *np.random.default_rng(5).integers((2, 1), (90, 12), (8, 2)).tolist()])
 def test_a_rollout_starts_at_the_first_field_that_truth_follows(frames, every):
     tiny = load_scene(TINY)
-    at_fields = range(0, frames, every)
-    usable = [frame for frame in at_fields if frame >= max(int(0.5 * (frames - 1)), 1) and frame + 5 <= frames - 2]
+    field_frames = range(0, frames, every)
+    usable = [frame for frame in field_frames if frame >= max(int(0.5 * (frames - 1)), 1) and frame + 5 <= frames - 2]
     if usable:
-        assert rollout_start(tiny.simulation, tiny.tracers, 0.5, frames, at_fields) == usable[0]
+        assert rollout_start(tiny.simulation, tiny.tracers, 0.5, frames, field_frames) == usable[0]
     else:
         with pytest.raises(SceneError, match="start: from frame"):
-            rollout_start(tiny.simulation, tiny.tracers, 0.5, frames, at_fields)
+            rollout_start(tiny.simulation, tiny.tracers, 0.5, frames, field_frames)

@@ -224,7 +224,7 @@ def test_a_rollout_is_forced_like_its_truth_and_starts_after_the_training_window
         # Each frame has a field. The first frame has no rates.
         for each, start in ((scene, ends), (trained_on(scene, other), 1)):
             seen = each.seen_in(tmp_path / "own")
-            assert rollout_start(each.simulation, each.tracers, seen, len(truth.times), truth.at_fields) == start
+            assert rollout_start(each.simulation, each.tracers, seen, len(truth.times), truth.field_frames) == start
         assert ends > 2
 
 

@@ -11,7 +11,7 @@ from eddies.io.hdf5 import ProductError, create_product
 from eddies.pipeline import STAGES
 from eddies.scene.scene import load_scene
 from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, stage_fingerprint, stage_provenance
-from eddies.workflows.run_directory.work import WorkAtStake, find_work
+from eddies.workflows.run_directory.work import WouldReplaceWork, find_work
 from tests.small_scene import TINY
 
 MAKING = ("dns", "train-kernel", "train", "simulate")
@@ -40,7 +40,7 @@ def save(comm, directory, scene, stage, step):
 def test_what_fits_is_done_whatever_is_to_be_made_before_it(comm, tmp_path, scene):
     for directory in (tmp_path, tmp_path / "nowhere"):
         work = find_work(scene.stages, scene, directory)
-        assert not work.done and not work.useless and not work.lost
+        assert not work.done and not work.obsolete and not work.lost
     leave(comm, tmp_path, scene)
     assert find_work(scene.stages, scene, tmp_path).done == set(MAKING)
     (tmp_path / "kernel.h5").unlink()
@@ -70,7 +70,7 @@ def test_what_would_be_replaced_is_named_with_cost_and_reason(comm, tmp_path, sc
         stage for stage in stages if STAGES[stage].file in lost}
     if not lost:
         return work.refuse_to_lose()
-    with pytest.raises(WorkAtStake) as refused:
+    with pytest.raises(WouldReplaceWork) as refused:
         work.refuse_to_lose()
     message = str(refused.value)
     assert changes in message and "--overwrite" in message
@@ -84,19 +84,19 @@ def test_checkpoints_of_other_settings_are_work_too(comm, tmp_path, scene):
     other = load_scene(TINY, ["training.steps=70"])
     save(comm, tmp_path, other, "train", 5)
     work = find_work(scene.stages, scene, tmp_path)
-    assert work.useless == {"train"} and not work.begun
-    with pytest.raises(WorkAtStake, match=r"checkpoints-train \(step 5\)"):
+    assert work.obsolete == {"train"} and not work.begun
+    with pytest.raises(WouldReplaceWork, match=r"checkpoints-train \(step 5\)"):
         work.refuse_to_lose()
     (tmp_path / "scene.toml").write_text(other.to_toml())
     (tmp_path / "stage_seconds.json").write_text('{"train": 125}')
-    with pytest.raises(WorkAtStake, match=r"steps = 70, now 60.* checkpoints-train \(step 5, took 2 min 05 s\)"):
+    with pytest.raises(WouldReplaceWork, match=r"steps = 70, now 60.* checkpoints-train \(step 5, took 2 min 05 s\)"):
         find_work(scene.stages, scene, tmp_path).refuse_to_lose()
     assert not find_work(other.stages, other, tmp_path).lost
     assert not find_work(["dns"], scene, tmp_path).lost
     save(comm, tmp_path, scene, "train", 3)
     assert not find_work(scene.stages, scene, tmp_path).lost  # there is one to go on from
     (tmp_path / "checkpoints-train/step-00000003.h5").write_text("damaged")
-    assert find_work(scene.stages, scene, tmp_path).useless == {"train"}
+    assert find_work(scene.stages, scene, tmp_path).obsolete == {"train"}
 
 
 @pytest.mark.mpi(1)
@@ -109,12 +109,12 @@ def test_the_last_state_of_a_ground_truth_is_for_longer_ones(comm, tmp_path, sce
     with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", provenance):
         pass
     work = find_work(["dns"], scene, tmp_path)
-    assert work.done == {"dns"} and not work.useless
+    assert work.done == {"dns"} and not work.obsolete
     work = find_work(["dns"], load_scene(TINY, [f"tracers.turnovers={turnovers}"]), tmp_path)
     assert (work.begun == {"dns"}) == begun and [each.split()[0] for each in work.lost] == lost
-    assert (work.useless == {"dns"}) != begun
+    assert (work.obsolete == {"dns"}) != begun
     work = find_work(["dns"], load_scene(TINY, ["seed=5"]), tmp_path)
-    assert [each.split()[0] for each in work.lost] == ["ground_truth.h5"] and work.useless == {"dns"}
+    assert [each.split()[0] for each in work.lost] == ["ground_truth.h5"] and work.obsolete == {"dns"}
 
 
 @pytest.mark.mpi(1)
@@ -123,10 +123,10 @@ def test_checkpoints_beside_a_product_that_fits_are_for_whoever_replaces_it(comm
     other = load_scene(TINY, ["training.steps=70"])
     save(comm, tmp_path, other, "train", 5)
     work = find_work(["train"], scene, tmp_path)
-    assert work.done == {"train"} and not work.useless and not work.lost
+    assert work.done == {"train"} and not work.obsolete and not work.lost
     assert [each.split()[0] for each in find_work(["train"], other, tmp_path).lost] == ["model.h5"]
     save(comm, tmp_path, scene, "train", 7)  # left behind, as the product is complete
-    assert find_work(["train"], scene, tmp_path).useless == {"train"}
+    assert find_work(["train"], scene, tmp_path).obsolete == {"train"}
 
 
 @pytest.mark.mpi(1)
@@ -149,5 +149,5 @@ def test_checkpoints_of_another_format_and_unreadable_products_are_not_replaced(
         patch.setattr(checksums, "_opened", refuse)
         find_work(["dns"], scene, tmp_path)
     (tmp_path / "ground_truth.h5").write_bytes(b"damaged")
-    with pytest.raises(WorkAtStake, match=r"ground_truth.h5 \(damaged"):
+    with pytest.raises(WouldReplaceWork, match=r"ground_truth.h5 \(damaged"):
         find_work(["dns"], scene, tmp_path).refuse_to_lose()

@@ -103,15 +103,16 @@ def estimate(scene: Scene) -> Estimates:
                          for part in (scene.spin_up, tracers))
     intervals: int | None = 0
     if tracers:
-        intervals = None if followed is None else max(_whole(followed / tracers.frame_interval), 1)
+        intervals = None if followed is None else max(_rounded_up(followed / tracers.frame_interval), 1)
     run_time = steps = None
     if spin_up is not None and followed is not None:
         alone = spin_up + (time.duration or 0.0)
         run_time = alone + followed
         if step is not None:
             longest = min(time.step or bound, time.max_step)
-            # With tracers, each frame interval is divided into equal steps.
-            steps = _whole(alone / step) + (intervals * _whole(tracers.frame_interval / longest) if tracers else 0)
+            steps = _rounded_up(alone / step)
+            if tracers:  # each frame interval is divided into equal steps
+                steps += intervals * _rounded_up(tracers.frame_interval / longest)
     shells, allowed, rollout_step, rollout = 0, None, math.inf, None
     if tracers:
         highest = resolved_wavenumber(tracers.spacing, tracers.filter_width,
@@ -124,7 +125,7 @@ def estimate(scene: Scene) -> Estimates:
         rollout_step = settings.frame_interval if math.isinf(settings.longest_step) else settings.longest_step
         if scene.coarse_cells and peak:
             rollout_step = min(rollout_step, time.courant * BOX_LENGTH / scene.coarse_cells / peak)
-        elif "model" in settings.needs and scene.resolves:
+        elif "model" in settings.needs and scene.needs_resolved_velocity:
             rollout_step = min(rollout_step, allowed or math.inf)
         if turbulence is not None and settings.method in METHODS:
             rollout = rollout_in(settings, turbulence.turnover_time, rollout_step)
@@ -188,16 +189,16 @@ def flow_step(time: Time, bound: float | None) -> tuple[float | None, str]:
 def rollout_in(settings: Simulation, turnover_time: float, longest: float) -> Rollout:
     """Rollout in a flow of a given turnover time, with steps no longer than `longest`."""
     interval = settings.frame_interval
-    intervals, step = _whole(settings.turnovers * turnover_time / interval), longest
+    intervals, step = _rounded_up(settings.turnovers * turnover_time / interval), longest
     if settings.on_grid or not settings.scheme.dense:  # a whole number of steps between two frames
-        within = _whole(interval / longest)
+        within = _rounded_up(interval / longest)
         step, steps = interval / within, intervals * within
     else:
-        steps = _whole(intervals * interval / longest)
+        steps = _rounded_up(intervals * interval / longest)
     return Rollout(turnover_time, intervals, step, steps,
                    0 if settings.on_grid else settings.scheme.evaluations * steps + 1)
 
 
-def _whole(ratio: float) -> int:
+def _rounded_up(ratio: float) -> int:
     """Round up to a whole number; an excess of the order of round-off is ignored."""
     return math.ceil(ratio - 1e-9)

@@ -34,15 +34,16 @@ def most_ranks(scene: Scene) -> dict[str, int]:
     if trains:
         # The a-priori test interpolates filtered fields to the particles.
         limits["ghost planes of the filtered fields"] = max(tracers.cells // GHOST_PLANES["quintic"], 1)
-        if scene.resolves:
+        if scene.needs_resolved_velocity:
             limits[RESOLVED] = resolved_grid_ranks(tracers, skin / 2)
     if trains and scene.own_training:
         turbulence = expected_turbulence(scene.flow, scene.initial, scene.forcing)
-        horizons, resolves, truths = scene.own_training.horizons, scene.resolves, scene.own_training.truths or ()
+        horizons, truths = scene.own_training.horizons, scene.own_training.truths or ()
         limits |= horizon_limits(horizons, tracers, turbulence.velocity_rms if turbulence else 0.0, learned_neighbors,
-                                 resolves)
+                                 scene.needs_resolved_velocity)
         for name, path in zip(truths, scene.own_training.truth_files):
-            if found := truth_limits(path, horizons, tracers, learned_neighbors, resolves):
+            found = truth_limits(path, horizons, tracers, learned_neighbors, scene.needs_resolved_velocity)
+            if found:
                 reason = min(found, key=found.__getitem__)
                 limits[f"[training] truths: {quoted(name)}: {reason}"] = found[reason]
     if scene.reconstruction:
@@ -56,7 +57,7 @@ def most_ranks(scene: Scene) -> dict[str, int]:
         limits["ghost planes of the coarse grid"] = max(scene.coarse_cells // ghosts, 1)
         if scene.eulerian and scene.eulerian.start == "particles":
             limits[RESOLVED] = resolved_grid_ranks(tracers, 0.0)
-    elif scene.injects:
+    elif scene.rollout_is_forced:
         limits[RESOLVED] = resolved_grid_ranks(tracers, skin / 2)
     fewest = min(limits.values())
     return limits | {f"variant {name}: {reason}": ranks for name, variant in scene.variant.items()
@@ -64,7 +65,7 @@ def most_ranks(scene: Scene) -> dict[str, int]:
 
 
 def horizon_limits(horizons: Horizons | None, tracers: Tracers, velocity: float, neighbors: float,
-                   resolves: bool) -> dict[str, int]:
+                   needs_resolved_velocity: bool) -> dict[str, int]:
     """Limits on the number of ranks from the training through horizons, where particles stay on their rank.
 
     `velocity` is the rms of a component; `neighbors` is 0 for a model without pairs.
@@ -76,24 +77,24 @@ def horizon_limits(horizons: Horizons | None, tracers: Tracers, velocity: float,
     if neighbors:
         limits |= reach_limit(tracers, tracers.radius_of(neighbors) + 2 * PEAK_VELOCITY * velocity * time,
                               " in the training through horizons")
-    if horizons.energy_weight > 0 or resolves:
+    if horizons.energy_weight > 0 or needs_resolved_velocity:
         limits["ghost planes of the grid in the training through horizons"] = resolved_grid_ranks(
             tracers, ALLOWED_VELOCITY * velocity * time)
     return limits
 
 
 def truth_limits(path: Path, horizons: Horizons | None, tracers: Tracers, neighbors: float,
-                 resolves: bool) -> dict[str, int]:
+                 needs_resolved_velocity: bool) -> dict[str, int]:
     """Limits of the training on a ground truth of another run, which may have another number of particles; empty if
     the file is missing."""
     reference = product_attributes(path, "reference")
     if "spacing" not in reference:
         return {}
     tracers = tracers.with_count(round((BOX_LENGTH / reference["spacing"]) ** 3))
-    limits = horizon_limits(horizons, tracers, reference["velocity_rms"], neighbors, resolves)
+    limits = horizon_limits(horizons, tracers, reference["velocity_rms"], neighbors, needs_resolved_velocity)
     if neighbors:
         limits |= reach_limit(tracers, tracers.radius_of(neighbors))
-    if resolves or product_attributes(path, "forcing"):
+    if needs_resolved_velocity or product_attributes(path, "forcing"):
         limits[RESOLVED] = resolved_grid_ranks(tracers, 0.0)
     return limits
 

@@ -76,7 +76,7 @@ def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
     elif rollout and kernel:       # a report reconstructs model and truth at particles and grid points
         pairs = 2 * (rollout.intervals + 1) * (tracers.particles + tracers.cells**3) * kernel.neighbors
         pairs *= FORM_PAIRS[kernel.form]
-    if solves and scene.resolves:
+    if solves and scene.needs_resolved_velocity:
         calls += solves * COLD
         transforms += solves * COLD * ITERATION * tracers.planes**3
     if stage in ("train", "find-step", "simulate") and model:

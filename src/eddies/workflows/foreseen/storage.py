@@ -14,7 +14,7 @@ from eddies.scene.scene import Flow, Scene, Tracers
 from eddies.scene.sections import RECONSTRUCTED
 from eddies.spectral.fourier_passes import BLOCK_BYTES
 from eddies.workflows.foreseen.numbers import estimate
-from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_PARTICLES, whole_cells, whole_frames
+from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_PARTICLES, unfiltered_frames, whole_cells
 
 # A process before any field, without and with torch; a report with its figures.
 FLOW_PROCESS, TORCH_PROCESS, REPORT_PROCESS = 100e6, 285e6, 280e6
@@ -39,7 +39,7 @@ def memory(scene: Scene, stage: str, ranks: int) -> float:
         lists = KERNEL_FIELDS * NEIGHBOR_BYTES * points + GRADIENT_BYTES * min(kernel.points, points)
         return TORCH_PROCESS + KERNEL_FIELDS * TABLE_BYTES * own + lists * kernel.neighbors
     skin, evaluation = scene.simulation.skin if scene.simulation else 0.0, PARTICLE_BYTES * own
-    if scene.resolves or stage != "train":
+    if scene.needs_resolved_velocity or stage != "train":
         evaluation += POINT_BYTES * planes**2 * math.ceil(planes / ranks)
     if scene.model and "pairs" in scene.model.reads:
         ghosts = tracers.particles * scene.interaction_radius * (1 + skin) / math.pi if ranks > 1 else 0.0
@@ -64,11 +64,11 @@ def flow_memory(flow: Flow, tracers: Tracers | None, ranks: int) -> float:
 
 class Disk(NamedTuple):
     """Disk of a stage in bytes. kept: what it leaves in the run directory, None if unknown. scratch: files that it
-    removes at its end. beside: the part of `kept` that is not in its product."""
+    removes at its end. other_files: the part of `kept` that is not in its product."""
 
     kept: float | None
     scratch: float = 0.0
-    beside: float = 0.0
+    other_files: float = 0.0
 
 
 def disk(scene: Scene, stage: str) -> Disk:
@@ -83,7 +83,7 @@ def disk(scene: Scene, stage: str) -> Disk:
             return Disk(state + statistics + 4 * flow.components * flow.cells**3, checkpoints, state)
         during, after = (
             trajectory_bytes(flow, tracers, frames,
-                             len(whole_frames(scene.simulation, scene.training, tracers.field_every, frames)))
+                             len(unfiltered_frames(scene.simulation, scene.training, tracers.field_every, frames)))
             for frames in (intervals or 0, (intervals or 0) + 1))
         if tracers.sets:  # each has the statistics; the run directory has the final fields and no last state
             after += len(tracers.sets) * statistics + 4 * flow.components * flow.cells**3

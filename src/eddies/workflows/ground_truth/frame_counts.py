@@ -1,7 +1,7 @@
 """Which frames of a ground truth the stages use, and whether they are enough.
 
-`frames` is the number of frames, `at_fields` are the frames at whose time a filtered field is stored, and `seen` is the
-fraction of the ground truth that the model is trained on.
+`frames` is the number of frames, `field_frames` are the frames at whose time a filtered field is stored, and `seen` is
+the fraction of the ground truth that the model is trained on.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ TESTED_FRAMES, TESTED_PARTICLES = 9, 20_000  # of the a-priori test, which store
 def check_frames(stages: Sequence[str], tracers: Tracers, training: Training | None, simulation: Simulation | None,
                  seen: float, frames: int) -> None:
     """Raise SceneError if there are too few frames for a stage; `training` is None for weights of another run."""
-    at_fields = range(0, frames, tracers.field_every)
+    field_frames = range(0, frames, tracers.field_every)
     if "train" in stages:
         if training is not None and seen > 0:
-            trained_frames(training, frames, at_fields)
-        between_frames(frames, at_fields)
+            trained_frames(training, frames, field_frames)
+        between_frames(frames, field_frames)
     if "simulate" in stages:
-        rollout_start(simulation, tracers, seen, frames, at_fields)
+        rollout_start(simulation, tracers, seen, frames, field_frames)
 
 
 def last_seen(window: float, frames: int) -> int:
@@ -47,11 +47,11 @@ def last_trained_on(settings: Training, frames: int) -> int:
     return last - held_out
 
 
-def trained_frames(settings: Training, frames: int, at_fields: Sequence[int]) -> tuple[list[int], int]:
+def trained_frames(settings: Training, frames: int, field_frames: Sequence[int]) -> tuple[list[int], int]:
     """The frames for training, and the last frame for validation. A field loss that compares with the flow needs a
     filtered field one frame later. Raises SceneError if no frame remains."""
     learned, last = last_trained_on(settings, frames), last_seen(settings.window, frames)
-    fields = set(at_fields)
+    fields = set(field_frames)
     usable = [frame for frame in range(1, last) if not settings.wants_fields or frame + 1 in fields]
     trained, held_out = ([frame for frame in usable if (frame <= learned) == seen] for seen in (True, False))
     if not trained or not held_out:
@@ -61,21 +61,21 @@ def trained_frames(settings: Training, frames: int, at_fields: Sequence[int]) ->
     return trained, held_out[-1]
 
 
-def between_frames(frames: int, at_fields: Sequence[int]) -> list[int]:
+def between_frames(frames: int, field_frames: Sequence[int]) -> list[int]:
     """The frames that have a filtered field and a frame on both sides. Raises SceneError if there is none."""
-    usable = [frame for frame in at_fields if 0 < frame < frames - 1]
+    usable = [frame for frame in field_frames if 0 < frame < frames - 1]
     if not usable:
         raise SceneError("[tracers] field_every: no filtered field is stored between the first and the last frame; "
                          "lower it, or raise [tracers] turnovers")
     return usable
 
 
-def rollout_start(settings: Simulation, tracers: Tracers, seen: float, frames: int, at_fields: Sequence[int]) -> int:
+def rollout_start(settings: Simulation, tracers: Tracers, seen: float, frames: int, field_frames: Sequence[int]) -> int:
     """The first frame with a filtered field at or after [simulation] start, by default the end of the training window.
     Raises SceneError if the ground truth ends before the next frame of the rollout."""
     wanted = _frame_at(settings.start, seen, frames)
     last = frames - 2 - round(settings.frame_interval / tracers.frame_interval)
-    usable = [frame for frame in at_fields if wanted <= frame <= last]
+    usable = [frame for frame in field_frames if wanted <= frame <= last]
     if not usable:
         raise SceneError(f"[simulation] start: from frame {wanted} of {frames} on, no frame has a filtered field and "
                          f"one more frame interval of the rollout ({settings.frame_interval:g}) after it; lower start, "
@@ -83,7 +83,7 @@ def rollout_start(settings: Simulation, tracers: Tracers, seen: float, frames: i
     return usable[0]
 
 
-def whole_frames(settings: Simulation | None, training: Training | None, every: int, frames: int) -> set[int]:
+def unfiltered_frames(settings: Simulation | None, training: Training | None, every: int, frames: int) -> set[int]:
     """The frames with the unfiltered state, for coarse grids. Every `every`-th frame has a filtered field.
 
     Rollouts start at these frames: at the start of [simulation], and, where the model is not trained on this ground

@@ -81,9 +81,9 @@ class TrackFrames:
     def __init__(self, comm: Comm, settings: Settings) -> None:
         self.comm = comm
         self.times, self.about, self.mean_count, self.complete, self.spacing, self.most = in_files(
-            comm, settings.file, lambda: ((found := measured(settings)).times, found.about, found.mean_count,
+            comm, settings.file, lambda: ((found := read_measured(settings)).times, found.about, found.mean_count,
                                           found.complete, found.spacing, int(np.diff(found.starts).max())))
-        self._tracks = measured(settings) if comm.rank == 0 else None
+        self._tracks = read_measured(settings) if comm.rank == 0 else None
 
     def frame(self, number: int, complete: bool = False) -> dict[str, np.ndarray]:
         """This rank's block of the rows of a frame (`MeasuredTracks.frame`)."""
@@ -103,17 +103,17 @@ class TrackFrames:
         return dict(self.comm.scatter(blocks))
 
 
-def measured(settings: Settings) -> MeasuredTracks:
+def read_measured(settings: Settings) -> MeasuredTracks:
     """The tracks of a file; one rank calls it. If splines are needed, tracks with fewer than three rows are left out.
 
     Raises ProductError if the file is unfit, SceneError if it has too few frames.
     """
     state = settings.file.stat() if settings.file.is_file() else None
-    return _measured(settings, state and (state.st_size, state.st_mtime_ns))
+    return _read_measured(settings, state and (state.st_size, state.st_mtime_ns))
 
 
 @lru_cache(maxsize=1)  # a run asks twice
-def _measured(settings: Settings, state: tuple[int, int] | None) -> MeasuredTracks:
+def _read_measured(settings: Settings, state: tuple[int, int] | None) -> MeasuredTracks:
     found = read_tracks(settings.file, settings.format, settings.group, settings.interval)
     found, edge, volume, corner = _placed(found, settings)
     if settings.sound_speed is not None and found.density is None:

@@ -88,18 +88,18 @@ class GroundTruth:
         return self._together(lambda: series.read(index, variable, slab.start, slab.stop)).astype(np.float64)
 
     @cached_property
-    def at_fields(self) -> list[int]:
+    def field_frames(self) -> list[int]:
         """The frames at the times of the filtered fields."""
         return self._frames_of(self.fields)
 
     @cached_property
-    def at_states(self) -> list[int]:
+    def state_frames(self) -> list[int]:
         """The frames at the times of the unfiltered flow; none for measured tracks."""
         return [] if "tracks" in self._file else self._frames_of(self.states)
 
     def field_at(self, frame: int, points: torch.Tensor) -> np.ndarray:
         """The stored filtered velocity (m, 3) at the time of a frame, at the `grid_points` (m, 3) of this rank."""
-        cells, index = self.fields.cells, self.at_fields.index(frame)
+        cells, index = self.fields.cells, self.field_frames.index(frame)
         planes = len(points) // cells**2
         first = round(float(points[0, 2]) * cells / self.decomposition.length) if planes else 0
         field = self._together(lambda: self.fields.read(index, "velocity", first, first + planes))

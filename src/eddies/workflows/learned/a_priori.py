@@ -28,7 +28,7 @@ def evaluation_frames(truth: GroundTruth) -> np.ndarray:
 
     Raises SceneError if the ground truth has no such frame.
     """
-    usable = np.array(between_frames(len(truth.times), truth.at_fields))
+    usable = np.array(between_frames(len(truth.times), truth.field_frames))
     return usable[evenly(len(usable), TESTED_FRAMES)]
 
 
@@ -86,7 +86,7 @@ def _given_rate_error(truth: GroundTruth, dynamics: ParticleDynamics, index: int
 
 def _pressure_force(truth: GroundTruth, index: int, particles: ParticleSet) -> torch.Tensor:
     """-c^2 grad ln(rho) of the filtered field at the particles (n, 3)."""
-    at = truth.at_fields.index(index)
+    at = truth.field_frames.index(index)
     slab = SlabDecomposition(truth.decomposition.comm, truth.decomposition.length, truth.fields.cells)
     grid = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
     planes = truth.planes(truth.fields, at, "density", slab)

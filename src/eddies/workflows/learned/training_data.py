@@ -53,7 +53,7 @@ class TrainingData:
         self.longest = max(settings.horizons.frames) if settings.horizons else 0
         self.last = last_seen(settings.window, len(truth.times))
         self.learned = last_trained_on(settings, len(truth.times))
-        self.usable, self.held_out = trained_frames(settings, len(truth.times), truth.at_fields)
+        self.usable, self.held_out = trained_frames(settings, len(truth.times), truth.field_frames)
 
     @cached_property
     def frames(self) -> list[TrainingFrame]:

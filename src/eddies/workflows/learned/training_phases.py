@@ -29,7 +29,7 @@ VALIDATION_PARTICLES, COMBINED_DRAWS = 8192, 8
 # Number of validations in a phase.
 VALIDATIONS, HORIZON_VALIDATIONS = 25, 4
 # Least number of validations within the patience of a phase.
-LOOKS = 4
+LEAST_VALIDATIONS = 4
 
 Trainer = TypeVar("Trainer")
 
@@ -49,7 +49,7 @@ def one_step_phases(data: Sequence[TrainingData], kernel: SmoothingKernel | None
     def phase(name: str, steps: int, rates: tuple[float, float], take, error) -> Phase:
         # The unit of work is one evaluation of the force on one particle.
         work = np.array([float(_at_turn(trainers, step).batch) for step in range(steps)])
-        every = max(min(steps // VALIDATIONS, (settings.patience or steps) // LOOKS), 1)
+        every = max(min(steps // VALIDATIONS, (settings.patience or steps) // LEAST_VALIDATIONS), 1)
         return Phase(name, work, rates, lambda optimizer, step: take(_at_turn(trainers, step), optimizer, step),
                      _mean(error, trainers, held_out), every, settings.patience)
 
@@ -127,13 +127,13 @@ def take_all_steps(training: Training, guard: Guard, stage: str, section: str, r
     progress = ProgressLine(stage, describe, done=training.done)
     while training.running:
         guard(training)
-        phase = training.number
+        phase = training.phase_number
         try:
             training.step()
         except (TrainingDiverged, HaloError) as error:
             raise SceneError(f"[{section}] {error}; {remedy}") from None
         if training.running:
             progress(training.done, training.steps)
-        if training.number != phase:
+        if training.phase_number != phase:
             progress.renew()
         after_each(training)

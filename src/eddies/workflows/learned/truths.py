@@ -72,11 +72,11 @@ def _problems_of(file: File, settings: Training, tracers: Tracers, reads: Collec
         return
     truth = _truth_in(file, tracers, comm)
     scales = truth.scales
-    here, there = tracers.filter_width / tracers.spacing, scales.filter_width / scales.spacing
-    if not math.isclose(here, there, rel_tol=1e-6):
-        yield (f"its filter is {there:.9g} mean spacings wide, but [tracers] filter_width = "
-               f"{tracers.filter_width:.9g} is {here:.9g} mean spacings; give another run, or set filter_width = "
-               f"{there * tracers.spacing:.9g}")
+    own_ratio, other_ratio = tracers.filter_width / tracers.spacing, scales.filter_width / scales.spacing
+    if not math.isclose(own_ratio, other_ratio, rel_tol=1e-6):
+        yield (f"its filter is {other_ratio:.9g} mean spacings wide, but [tracers] filter_width = "
+               f"{tracers.filter_width:.9g} is {own_ratio:.9g} mean spacings; give another run, or set filter_width = "
+               f"{other_ratio * tracers.spacing:.9g}")
     if "density" in reads and not truth.has_density:
         yield ("holds no density, which the terms of [model] read; give a run of a compressible flow, or remove these "
                "terms")
@@ -90,4 +90,4 @@ def _problems_of(file: File, settings: Training, tracers: Tracers, reads: Collec
     if settings.horizons and not math.isclose(tracers.frame_interval, interval, rel_tol=1e-6):
         yield (f"its frames are {interval:.6g} apart, but [training.horizons] counts frames of [tracers] "
                f"frame_interval = {tracers.frame_interval:g}; make both equal, or remove [training.horizons]")
-    trained_frames(settings, len(truth.times), truth.at_fields)
+    trained_frames(settings, len(truth.times), truth.field_frames)

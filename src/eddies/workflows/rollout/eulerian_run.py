@@ -188,7 +188,7 @@ def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame:
     flow is not stored at that frame.
     """
     grid, series = fluid.grid, truth.states
-    if frame not in truth.at_states:
+    if frame not in truth.state_frames:
         stored = ", ".join(f"{time / truth.times[-1]:.3g}" for time in series.times)
         remedy = f"only at {stored}; set [simulation] start to such a value, or make" if stored else "at no time; make"
         raise SceneError(
@@ -198,7 +198,7 @@ def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame:
     whole = SpectralGrid(slab, grid.precision, (series.cells - 1) // 2)
 
     def stored_planes(variable: str) -> np.ndarray:
-        return truth.planes(series, truth.at_states.index(frame), variable, slab)
+        return truth.planes(series, truth.state_frames.index(frame), variable, slab)
 
     def kept(values: np.ndarray) -> np.ndarray:
         return regrid(whole, grid, whole.forward(values.astype(whole.real)))

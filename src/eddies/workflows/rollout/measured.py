@@ -66,7 +66,7 @@ class TrueParticles:
 
 
 @dataclass(frozen=True)
-class Made:
+class ComputedSeries:
     """A series with one column, computed frame by frame."""
 
     times: np.ndarray
@@ -84,7 +84,7 @@ class Made:
 
 
 #: The true tracers of a rollout without a ground truth.
-NOTHING = Made(np.zeros(0), "velocity", lambda frame: np.zeros((0, 3)))
+NOTHING = ComputedSeries(np.zeros(0), "velocity", lambda frame: np.zeros((0, 3)))
 
 
 class OnDemand(dict):
@@ -137,11 +137,12 @@ class MeasuredRollout:
         found: dict[str, Any] = {f"particles/{name}": run for name, run in self.particles.items() if name != "model"}
         for name, run in self.particles.items():
             if self._solver is not None:
-                found[f"spectra_of_{name}"] = Made(run.times, "energy", self.rollout.spectra[name].__getitem__)
+                found[f"spectra_of_{name}"] = ComputedSeries(run.times, "energy",
+                                                             self.rollout.spectra[name].__getitem__)
             if self.fields is not None:
                 found[f"fields/{name}"] = ReconstructedFields(run, self.fields)
-                found[f"gradients/{name}"] = Made(run.times, GRADIENT,
-                                                  lambda frame, run=run: self.fields.gradients(run, frame))
+                found[f"gradients/{name}"] = ComputedSeries(
+                    run.times, GRADIENT, lambda frame, run=run: self.fields.gradients(run, frame))
         return found
 
     def measure(self, comm: Comm, root: int = 0, page: bool = True, every_frame: bool = True,

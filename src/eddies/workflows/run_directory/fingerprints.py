@@ -13,7 +13,7 @@ from typing import Any
 from eddies.import_path import origins
 from eddies.pipeline import STAGES
 from eddies.scene.scene import FOREIGN_IN, Scene
-from eddies.scene.sections import OF_A_SET
+from eddies.scene.sections import SET_KEYS
 
 
 # The keys that only set the duration of a stage. If nothing else differs, a stage can continue from a checkpoint.
@@ -33,10 +33,10 @@ def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> 
         "truths": _fingerprints(training.truth_files if training else ()),
         "found_step": _digest(simulation.step_file if simulation else None),
         "confirming": _fingerprints(simulation.confirming_files if simulation else ())}
-    if scene.sets:  # OF_A_SET are the keys of each set; all sets share the others
+    if scene.sets:  # SET_KEYS are the keys of each set; all sets share the others
         sets = settings["tracers"].pop("sets")
-        settings["tracers"] = {key: value for key, value in settings["tracers"].items() if key not in OF_A_SET} | {
-            "sets": {name: {key: sets[name][key] for key in OF_A_SET} for name in sorted(sets)}}
+        settings["tracers"] = {key: value for key, value in settings["tracers"].items() if key not in SET_KEYS} | {
+            "sets": {name: {key: sets[name][key] for key in SET_KEYS} for name in sorted(sets)}}
     # The content of these files counts, not their paths.
     if settings["start"] is not None:
         del settings["tracks" if scene.tracks else "initial"]["path"]

@@ -16,7 +16,7 @@ from eddies.clock import duration
 from eddies.errors import UserError
 from eddies.io.checkpoint import checkpoints_in
 from eddies.io.checksums import open_to_read
-from eddies.io.errors import ProductError, unreadable
+from eddies.io.errors import ProductError, read_error
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.provenance import product_provenance
 from eddies.parallel.communicator import Comm
@@ -32,7 +32,7 @@ FAILURE = "failure.txt"  # the error of a failed variant
 MOST_CHANGES = 3  # in the message of a refusal
 
 
-class WorkAtStake(UserError):
+class WouldReplaceWork(UserError):
     """A command would replace work of other settings."""
 
 
@@ -43,16 +43,16 @@ class Work:
     directory: Path
     done: frozenset[str]  # stages whose product is complete and was made with the same settings
     begun: frozenset[str]  # stages that continue from a checkpoint
-    useless: frozenset[str]  # stages whose checkpoints are left over from a complete run, or belong to other settings
+    obsolete: frozenset[str]  # stages whose checkpoints are left over from a complete run, or belong to other settings
     lost: tuple[str, ...]  # the files that the stages would replace, with their cost
     changes: tuple[str, ...]  # the settings that differ from those of the lost files
 
     def refuse_to_lose(self) -> None:
-        """Raise WorkAtStake if anything would be replaced."""
+        """Raise WouldReplaceWork if anything would be replaced."""
         if self.lost:
-            raise WorkAtStake(f"{self.directory}: holds work of {of_other_settings(self.changes)} that would be "
-                              f"replaced: {', '.join(self.lost)}; add --overwrite to replace it, or choose another "
-                              "--output")
+            raise WouldReplaceWork(f"{self.directory}: holds work of {of_other_settings(self.changes)} that would "
+                                   f"be replaced: {', '.join(self.lost)}; add --overwrite to replace it, or choose "
+                                   "another --output")
 
 
 def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Collection[str] = ()) -> Work:
@@ -61,7 +61,7 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
 
     Raises ProductError if the system refuses to read a product or a checkpoint, which may be sound.
     """
-    done, begun, useless, lost, changes = set(), set(), set(), [], {}
+    done, begun, obsolete, lost, changes = set(), set(), set(), [], {}
     seconds = stage_seconds(directory)
     for stage in [STAGES[name] for name in stages if STAGES[name].product is not None]:
         product, settings = directory / stage.file, stage_fingerprint(scene, stage.name)
@@ -72,19 +72,19 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
         origin = product_provenance(product)
         complete, sets = origin.get("fingerprint") == settings, set_files(scene) if stage.name == "dns" else {}
         of_sets = {path: product_provenance(directory / path) for path in sets}
-        if complete and all(of_sets[path].get("fingerprint") == mark for path, mark in sets.items()):
+        if complete and all(of_sets[path].get("fingerprint") == fingerprint for path, fingerprint in sets.items()):
             done.add(stage.name)
             # Work of other settings may still be continued, and a direct simulation may go on for longer.
             if not of_others and stage.name != "dns":
-                useless.add(stage.name)
+                obsolete.add(stage.name)
             continue
-        for path, mark in sets.items():
-            if of_sets[path].get("fingerprint") != mark and (directory / path).is_file():
+        for path, fingerprint in sets.items():
+            if of_sets[path].get("fingerprint") != fingerprint and (directory / path).is_file():
                 lost.append(f"{path}{_cost(of_sets[path], None)}")
                 changes |= dict.fromkeys(changed_settings(stage, of_sets[path].get("scene"), scene.to_toml()))
         same_course = checkpoints and not of_others and origin.get("course") == continued and stage.name not in links
         if same_course and origin["duration"] > scene.duration:
-            useless.add(stage.name)  # the checkpoint is too late
+            obsolete.add(stage.name)  # the checkpoint is too late
         elif same_course:
             begun.add(stage.name)
             continue
@@ -93,17 +93,17 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
                 _check_readable(product)
             lost.append(stage.file + _cost(origin, seconds.get(stage.name)))
             changes |= dict.fromkeys(changed_settings(stage, origin.get("scene"), scene.to_toml()))
-        if checkpoints and not of_others and stage.name not in useless:
+        if checkpoints and not of_others and stage.name not in obsolete:
             begun.add(stage.name)
         if of_others:
-            useless.add(stage.name)
+            obsolete.add(stage.name)
             if origin.get("course") in [fingerprint for _, fingerprint in checkpoints]:
                 continue  # the last state of the product, which `lost` has already
             seconds_so_far = seconds.get(stage.name)
             cost = "" if seconds_so_far is None else f", took {duration(seconds_so_far)}"
             lost.append(f"{stage.checkpoints} (step {checkpoints[0][0]}{cost})")
             changes |= dict.fromkeys(changed_settings(stage, _scene_of(directory), scene.to_toml()))
-    return Work(directory, frozenset(done), frozenset(begun), frozenset(useless), tuple(lost), tuple(changes))
+    return Work(directory, frozenset(done), frozenset(begun), frozenset(obsolete), tuple(lost), tuple(changes))
 
 
 def _scene_of(directory: Path) -> str | None:
@@ -174,7 +174,7 @@ def _check_readable(product: Path) -> None:
     try:
         open_to_read(product).close()
     except OSError as error:
-        if problem := unreadable(product, error):
+        if problem := read_error(product, error):
             raise problem from None
     except ProductError:
         return
