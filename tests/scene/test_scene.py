@@ -116,6 +116,12 @@ def test_coarse_grids_that_are_refused(overrides, message):
     assert message in str(error.value)
 
 
+def test_a_coarse_grid_that_starts_from_particles_may_be_finer_than_the_flow():
+    """Tracks come with a flow that has only the modes that they resolve."""
+    scene = load_scene(TINY, ["simulation.method=eulerian", "eulerian.cells=50", "eulerian.start=particles"])
+    assert scene.coarse_cells > scene.flow.cells
+
+
 @pytest.mark.parametrize("equations, closures", [
     ("unfiltered", {"none", "smagorinsky", "dynamic-smagorinsky", "spectral", "learned"}),
     ("filtered", {"none", "smagorinsky", "dynamic-smagorinsky", "gradient", "dynamic-mixed"})])

@@ -137,7 +137,8 @@ def errors_of(case: Case, directory: Path, truth: h5py.File) -> dict[str, np.nda
 
 
 def at_points(field: np.ndarray, edge: float, places: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """A field (components, z, y, x) on a periodic cube and its gradient at the points of a grid, after a Gaussian filter."""
+    """A field (components, z, y, x) on a periodic cube and its gradient, at points of a grid, after a Gaussian filter.
+    """
     cells = field.shape[1]
     number = np.fft.fftfreq(cells, 1 / cells) * (np.abs(np.fft.fftfreq(cells, 1 / cells)) < cells / 2)
     k = 2 * np.pi / edge * number
