@@ -18,10 +18,8 @@
 #SBATCH --export=ALL
 ##SBATCH --account=NAME
 ##SBATCH --partition=NAME
-EDDIES_SCENE=hit-paper
-ranks=(srun --mpi="${SLURM_MPI_TYPE:-pmix}" --export=ALL --cpus-per-task="${SLURM_CPUS_PER_TASK:-1}")
-ground_truth() { "${ranks[@]}" "$1" dns "${@:3}"; }  # only this stage; `run` would run all
-launcher=(ground_truth)
+EDDIES_SCENE=hit-paper EDDIES_STAGE=dns  # `run` would run all stages
+launcher=(srun --mpi="${SLURM_MPI_TYPE:-pmix}" --export=ALL --cpus-per-task="${SLURM_CPUS_PER_TASK:-1}")
 resubmit=(scontrol requeue "${SLURM_JOB_ID:-}")
 
 # ---- the same for every scheduler

@@ -15,12 +15,15 @@ from eddies.cli import main
 from eddies.cli_options import build_parser
 from eddies.particles.flow_units import BEYOND_DISSIPATION, BEYOND_NYQUIST, LEAST_TRANSFER
 from eddies.particles.resolved_velocity import TOLERANCE, TOLERANCE_PREDICTED, WEIGHT
+from eddies.pipeline import STAGES
 from eddies.scene.integrators import SCHEMES
 from eddies.scene.model import Model, settings_class
 from eddies.scene.rules import quoted
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError, Tracers, builtin_scenes, load_scene
 from eddies.scene.sections import METHODS, SET_KEYS, Simulation
 from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS
+from eddies.workflows.foreseen.numbers import estimate
+from eddies.workflows.foreseen.ranks import most_ranks
 
 CHECKOUT = Path(__file__).parents[1]
 PAGES = [CHECKOUT / "README.md", *(page for pages in ("*.md", "notes/*.md", "notebooks/*.ipynb")
@@ -56,14 +59,16 @@ def marked(name):
 OF_THE_MACHINE = "of memory here|are free here"  # a warning of a small machine, not of a command
 COMMANDS = [line.strip() for block in blocks("bash") for line in block.replace("\\\n", " ").splitlines()
             if line.strip() and not line.strip().startswith("#")]
-EXAMPLE_NAME, EXAMPLE = next(match.groups() for block in blocks("toml")
-                             if (match := re.fullmatch(r"# (\S+\.toml).*?\n(.*)", block, re.DOTALL)))
+# Scenes that begin with a comment with their file name.
+EXAMPLES = dict(match.groups() for block in blocks("toml")
+                if (match := re.fullmatch(r"# (\S+\.toml).*?\n(.*)", block, re.DOTALL)))
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with the example scene, to work in."""
-    (tmp_path / EXAMPLE_NAME).write_text(EXAMPLE, encoding="utf-8")
+    """A folder with the example scenes, to work in."""
+    for name, text in EXAMPLES.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -151,10 +156,23 @@ def test_variables_in_the_text_are_read_somewhere():
     assert set(re.findall(r"EDDIES_[A-Z]+", code)) <= named
 
 
-def test_example_scene_has_all_stages(folder):
-    scene = load_scene(EXAMPLE_NAME)
-    assert scene.name == Path(EXAMPLE_NAME).stem
-    assert scene.stages == ("dns", "train-kernel", "train", "simulate", "report")
+def test_example_scenes_have_all_stages(folder):
+    for name, left_out in (("slower-sound", {"reconstruct", "find-step"}), ("my-flow", {"reconstruct"})):
+        scene = load_scene(f"{name}.toml")
+        assert scene.name == name and scene.stages == tuple(stage for stage in STAGES if stage not in left_out)
+
+
+def test_numbers_of_the_own_flow_follow_its_rules(folder):
+    """Those of docs/own-flow.md, which `eddies check` prints."""
+    scene = load_scene("my-flow.toml")
+    expected = estimate(scene).turbulence
+    assert 1.2 < scene.flow.cells // 3 * expected.kolmogorov_length < 1.25
+    assert scene.tracers.frame_interval == pytest.approx(expected.kolmogorov_time / 3, rel=0.05)
+    assert scene.time.max_step == pytest.approx(expected.kolmogorov_time / 30, rel=0.05)
+    assert scene.tracers.filter_width == pytest.approx(36 * expected.kolmogorov_length, rel=0.02)
+    text = (CHECKOUT / "docs/own-flow.md").read_text(encoding="utf-8")
+    ranks = [min(most_ranks(each).values()) for each in (scene.ground_truth_alone, scene)]
+    assert f"| {ranks[0]}, {ranks[1]} |" in text and f"--ntasks-per-node={ranks[1]} " in text
 
 
 def test_table_of_scenes():
@@ -281,7 +299,7 @@ def test_formulas_shown_are_those_of_the_library():
 
 
 def test_example_with_variants(tmp_path):
-    example = next(block for block in blocks("toml") if "[variant." in block)
+    example = next(block for block in blocks("toml") if "[variant.small]" in block)
     (tmp_path / "example.toml").write_text(example, encoding="utf-8")
     assert list(load_scene(tmp_path / "example.toml").variant) == ["learned", "small", "no-force"]
 

@@ -7,6 +7,7 @@
 import math
 from itertools import pairwise
 
+from eddies.analysis.rollout import PLANES
 from eddies.flow.navier_stokes import FLUIDS, CompressibleFluid
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.scene.sections import NEIGHBORS
@@ -17,12 +18,14 @@ from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_FRA
 
 # Measured seconds on one and two cores of an AMD EPYC with AVX-512 (`tiny`, `hit-small`, `hit-coarse`). TRANSFORM: of
 # a grid point, times 1 + cells / CACHED in the direct simulation, whose planes outgrow the caches. PAIR: of a pair of
-# particles. WEIGHT: of a weight of a network, for each pair. CALL: overhead of an evaluation or iteration. MESSAGE: of
+# particles. TRACER: pairs that take as long as a step of a tracer. SINGLE: a point in single precision over one in
+# double. WEIGHT: of a weight of a network, for each pair. CALL: overhead of an evaluation or iteration. MESSAGE: of
 # a message; a call has ROUNDS of them for each further rank. START: overhead of a stage.
-TRANSFORM, CACHED, PAIR, WEIGHT, CALL, MESSAGE, ROUNDS = 4e-9, 550, 2.5e-8, 6e-11, 2.5e-4, 2e-6, 4
+TRANSFORM, CACHED, SINGLE, PAIR, TRACER, WEIGHT = 4e-9, 550, 0.65, 2.5e-8, 200, 6e-11
+CALL, MESSAGE, ROUNDS = 2.5e-4, 2e-6, 4
 START = {"dns": 0.4, "train-kernel": 0.7, "reconstruct": 1.0, "train": 1.0, "find-step": 0.5, "simulate": 0.3,
          "report": 2.3}
-FORM_PAIRS = {"average": 1, "linear": 5, "quadratic": 8, "kriging": 27}  # cost of a neighbour, in averages
+FORM_PAIRS = {"average": 1, "linear": 1.5, "quadratic": 2.5, "kriging": 6}  # cost of a neighbour, in averages
 SEARCH, CONFIRM = 2, 0.75    # turnovers of the rollouts of a search, and of those on each further ground truth
 COLD, ITERATION = 25, 12     # iterations of a solve without a first guess; transforms of a point in each
 GRADIENT = 4                 # an evaluation with its gradient, over an evaluation
@@ -40,6 +43,12 @@ def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
         calls, cells = expected.steps * STEPPERS[scene.time.stepper].evaluations, scene.flow.cells
         fluid = FLUIDS.get(scene.flow.fluid, CompressibleFluid)
         transforms = calls * fluid.transforms * cells**3 * (1 + cells / CACHED)
+        if scene.flow.precision == "float32":
+            transforms *= SINGLE
+        if tracers is not None:
+            followed = tracers.turnovers / (tracers.turnovers + (scene.spin_up.turnovers if scene.spin_up else 0.0))
+            particles = sum(each.particles for each in (tracers.sets.values() if tracers.sets else [tracers]))
+            pairs = expected.steps * followed * particles * TRACER
     elif stage == "train-kernel":  # twice
         calls = 2 * kernel.steps * GRADIENT
         pairs = kernel.neighbors * (kernel.steps * tracers.particles + 2 * KERNEL_FIELDS * tracers.cells**3)
@@ -73,8 +82,8 @@ def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
             transforms = calls * CompressibleFluid.transforms * scene.coarse_cells**3
         elif "model" in scene.simulation.needs:
             solves = rollout.evaluations * scene.simulation.scheme.iterations / COLD
-    elif rollout and kernel:       # a report reconstructs model and truth at particles and grid points
-        pairs = 2 * (rollout.intervals + 1) * (tracers.particles + tracers.cells**3) * kernel.neighbors
+    elif rollout and kernel:       # a page of a report: gradients at the particles of all frames, and a few fields
+        pairs = ((rollout.intervals + 1) * tracers.particles + PLANES * tracers.cells**3) * kernel.neighbors
         pairs *= FORM_PAIRS[kernel.form]
     if solves and scene.needs_resolved_velocity:
         calls += solves * COLD

@@ -33,8 +33,8 @@ from eddies.workflows.rollout.saved_particles import particle_state, restored_pa
 
 log = logging.getLogger("eddies")
 
-# A state is faulty if a particle is this many times faster, or its density deviates this many times more from the mean,
-# than the rms of the truth.
+# A state is faulty if a particle is this many times faster than the rms of the truth, or if its density deviates from
+# the mean by this many rms of the truth and by more than the mean itself.
 RUNAWAY_SPEED, RUNAWAY_DENSITY = 30.0, 300.0
 # Columns that are stored about the solves for the resolved velocity.
 SOLVES = "solves", "iterations", "most_iterations", "residual", "not_converged"
@@ -58,7 +58,7 @@ class ParticleRun:
             path = directory / STAGES["train"].file
             model = load_model(definition, self.comm, path, self.scales)
             if model.integrates_density and self.scales.density is not None:
-                deviation = RUNAWAY_DENSITY * self.scales.density
+                deviation = max(RUNAWAY_DENSITY * self.scales.density, self.scales.density_mean)
             if model.networks:
                 with open_product(self.comm, path, "model") as file:
                     self.seen = FeatureRange(**read_table(file, "feature_range"))
