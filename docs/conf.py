@@ -1,5 +1,7 @@
 """How Sphinx makes the site of these pages: .venv/bin/sphinx-build -W docs site."""
 
+import re
+
 import eddies
 from docutils import nodes
 from latex2mathml.converter import convert
@@ -28,12 +30,26 @@ html_title = "eddies"
 html_static_path = html_css_files = ["site.css"]
 
 
+def as_list(app, what, name, obj, options, lines):
+    """Make a list of the section Parameters, or Attributes, of a docstring, whose lines are `name : meaning`."""
+    text = "\n".join(lines)
+    for title in ("Parameters", "Attributes"):
+        head, underline, rest = text.partition(f"{title}\n{'-' * len(title)}\n")
+        if underline:
+            entries, _, rest = rest.partition("\n\n")
+            entries = re.sub(r"^(\w+(?:, \w+)*) : ", lambda found: f"* **{found[1]}**: ", entries, flags=re.M)
+            entries = re.sub(r"^ +", "  ", entries, flags=re.M)
+            text = f"{head}\n{entries}\n\n{rest}"
+    lines[:] = text.split("\n")
+
+
 def setup(app):
-    """Add the renderer of formulas."""
+    """Add lists of parameters and the renderer of formulas."""
     def math(display):
         def visit(translator, node):
             translator.body.append(convert(node.astext(), display=display))
             raise nodes.SkipNode
         return visit, None
 
+    app.connect("autodoc-process-docstring", as_list, priority=400)  # before napoleon
     app.add_html_math_renderer("mathml", math("inline"), math("block"))

@@ -74,6 +74,15 @@ def test_a_term_of_the_users(example):
 
 
 @pytest.mark.mpi(2)
+def test_a_pair_term_of_the_users(example):
+    run = example("own_drag")
+    _, terms, weights = results(run)
+    assert list(terms)[-1] == "own_drag:StrainDrag"
+    first, last = (weights[f"terms.StrainDrag.network.{part}"] for part in ("0.weight", "2.bias"))
+    assert first.shape == (8, 1) and last != np.float32(math.log(math.expm1(0.1)))  # it has been trained
+
+
+@pytest.mark.mpi(2)
 def test_a_network_of_the_users(example):
     run = example("own_network")
     _, terms, weights = results(run)
