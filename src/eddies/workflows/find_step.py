@@ -3,7 +3,7 @@
 The rule is the same for every method. The steps of an integrator differ by factors of two. A step is compared with half
 of it: the difference d of the final velocities (rms) is taken as the error that the step adds to the error e of the
 rollout. Independent errors add as squares. The step has converged if e^2 + d^2 is below (1.02 e)^2, which allows d to
-be a fifth of e, or if d is less than 1e-4 of the velocity. A step must also converge on all ground truths in
+be a fifth of e, or if d is less than 1e-3 of the velocity. A step must also converge on all ground truths in
 [simulation] confirmed_on. For coarse grids the step is a Courant number. The cheapest converged step is stored.
 
 The steps of the first integrator are halved until one has converged. The search with each other integrator starts at
@@ -45,7 +45,7 @@ log = logging.getLogger("eddies")
 
 TURNOVERS = 0.25  # duration of a short rollout in turnover times
 # Largest share of the error that a step may add, and relative change of the velocity that is always allowed.
-LARGEST_ERROR_SHARE, LEAST_TOLERANCE = 0.02, 1e-4
+LARGEST_ERROR_SHARE, LEAST_TOLERANCE = 0.02, 1e-3
 # Largest number of halvings of a step.
 HALVINGS = 12
 # Another integrator replaces the best one if it needs less than this share of its time. Measured times vary.
