@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from eddies.io import new_files
+from eddies.io.errors import WriteError
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import Stopped
 from eddies.particles.fourier_grid import FourierGrid
@@ -15,6 +17,7 @@ from eddies.scene.scene import Reconstruction
 from eddies.scene.sections import RECONSTRUCTED
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows import reconstruct
+from tests.full_disk import largest_file
 from tests.workflows.small_rollout import prepared
 from tests.workflows.stopping import StopAtStep
 
@@ -134,3 +137,20 @@ def test_a_stopped_reconstruction_is_the_one_never_stopped(comm, flow, tmp_path,
                 "particles/tracks/velocity/value", "errors_over_time/validation_error", "errors_of_fields/time")})
     for name, values in found[0].items():
         np.testing.assert_array_equal(values, found[1][name], err_msg=name)
+
+
+@pytest.mark.mpi(2)
+def test_a_reconstruction_without_room_leaves_nothing_and_goes_on(comm, flow, tmp_path, linked, monkeypatch):
+    """In place of a full disk the last rank may write so many bytes to a file."""
+    monkeypatch.setattr(new_files, "MARGIN_BYTES", 2**12)
+    scene, folder = flow
+    linked(folder)
+    scene = replace(scene, reconstruction=Reconstruction(fields=("velocity",), holdout=0.0))
+    for kilobytes in (1, 100):
+        with largest_file(comm, kilobytes * 1024, comm.size - 1), pytest.raises(WriteError, match="make room"):
+            reconstruct.run(scene, comm, tmp_path)
+        comm.Barrier()
+        assert not list(tmp_path.rglob("*.partial")) and not (tmp_path / "reconstruction.h5").exists()
+        comm.Barrier()
+    reconstruct.run(scene, comm, tmp_path)
+    assert (tmp_path / "reconstruction.h5").exists()
