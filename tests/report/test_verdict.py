@@ -39,7 +39,7 @@ def test_a_rollout_that_broke_is_poor_and_one_of_another_flow_is_not_judged():
     text, _ = verdict(stable=False, status="stopped: particle 3 is too fast")
     assert text.startswith("Poor: ") and "stopped: particle 3 is too fast" in text
     text, _ = verdict(stable=False, status="complete")
-    assert text.startswith("Poor: the rollout is not finite to its end.")
+    assert text.startswith("Poor: the rollout has values that are not finite.")
     text, marks = verdict(two_flows=True)
     assert "not judged" in text and "good" not in text and not marks
 
@@ -55,7 +55,7 @@ def test_model_and_kernel_are_compared_with_methods_without_training():
                              "wendland_velocity_error": 0.17,
                              "gradient_error": 0.35, "cubic_spline_gradient_error": 0.35})
     text = section({"model": model, "kernel": kernel}, warned=True).text
-    assert "no rollout" in text and "0.3, poor (exact filtered pressure gradient: 0.35)" in text
+    assert "no rollout" in text and "0.3, poor (with the exact filtered pressure gradient: 0.35)" in text
     assert "velocity error 0.2, worse than the Wendland kernel (0.17)." in text
     assert "gradient error 0.35, no improvement over the cubic spline (0.35)." in text and "warnings" in text
 

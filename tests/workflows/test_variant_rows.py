@@ -81,7 +81,7 @@ def test_a_note_gives_the_wavenumbers_that_grids_keep(tmp_path):
     scene = scene_of(tmp_path, ("grid-18", grid, "eulerian.cells = 18"), ("grid-16", grid, "eulerian.cells = 16"),
                      ("grid", grid))
     # A grid of 18 cells does not keep the mode 18/3 = 6. By default a grid has 8 cells, the smallest number.
-    assert "5 in grid-18, 5 in grid-16, 2 in grid; k_d = 3." in notes(scene)[1]
+    assert "5 in grid-18, 5 in grid-16, 2 in grid; the filter wavenumber k_d = pi/d is 3." in notes(scene)[1]
 
 
 @pytest.mark.mpi(1)

@@ -44,7 +44,8 @@ def error_series(run: Rollout) -> dict[str, np.ndarray]:
 
 
 def pdf_divergence(pair: Pair, edges: np.ndarray) -> float:
-    """Forward KL divergence of the PDFs of all components, both standardised by mean and deviation of the truth."""
+    """Forward KL divergence of the PDFs of truth and model, with all components in one PDF; both are standardised by
+    the mean and deviation of the truth."""
     return kl_divergence(bin_probabilities(standardized(pair.truth), edges),
                          bin_probabilities(standardized(pair.model, pair.truth), edges))
 

@@ -50,7 +50,8 @@ def verdict(model: Method, others: Sequence[Method], cost: str, measures: Mappin
             beaten.append(f"{short}: {rivals[0]['label']}" + (f" and {len(rivals) - 1} more" if rivals[1:] else ""))
         else:
             worth.append(short)
-    found = [f"As accurate and no slower (only the cheapest is named): {'; '.join(beaten)}."] if beaten else []
+    found = [f"Methods as accurate as {name} and no slower (only the cheapest is named): {'; '.join(beaten)}."
+             ] if beaten else []
     found += [f"{name} has no number for {'; '.join(unknown)}."] if unknown else []
     return [f"{name} is worth its cost in {'; '.join(worth)}." if worth else f"{name} is worth its cost in no measure.",
             " ".join(found) or "No other method is as accurate and no slower in any measure."]

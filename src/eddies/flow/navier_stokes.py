@@ -65,7 +65,7 @@ class IncompressibleFluid(Fluid):
         return -self.viscosity * self.grid.wavenumber_squared * state
 
     def linear_function(self, function: ScalarFunction, step: float) -> np.ndarray:
-        """Return f(step L) as the factor f(-nu k^2 step) of each mode: (kz >= 0, ky, 1, kx)."""
+        """Return f(step L): the factor f(-nu k^2 step) of each mode with kz >= 0, of shape (kz, ky, 1, kx)."""
         return functions_of_wavenumber(self.grid, lambda k2: [function(-self.viscosity * k2 * step).real])
 
     def combine(self, *terms: tuple[np.ndarray, np.ndarray]) -> np.ndarray:

@@ -206,7 +206,7 @@ def checkpoints_in(path: Path) -> list[tuple[int, str]]:
 
 
 def _newest_first(directory: Path) -> list[Path]:
-    """The checkpoints in a directory, the newest first. Up to version 1, a checkpoint was a directory."""
+    """The checkpoints in a directory, the newest first. In eddies 1.0 a checkpoint was a directory."""
     paths = directory.iterdir() if directory.is_dir() else ()
     return sorted((path for path in paths if (name := NAME.fullmatch(path.name)) and path.is_dir() == (not name[2])),
                   key=_step_of, reverse=True)

@@ -252,7 +252,7 @@ def _opened(path: Path) -> h5py.File:
 
 
 def _chosen(path: Path, holder: Mapping[str, Any], name: str | None, what: str) -> Any:
-    """The group with this name; None: the only group."""
+    """The group with this name, or the only group if the name is None. ProductError if there is no such group."""
     if name is None and len(holder) == 1:
         return next(iter(holder.values()))
     if name is not None and name in holder:

@@ -43,11 +43,11 @@ class ModePasses:
 
     def descend(self, length: float, inverse: np.ndarray, direction: np.ndarray, applied: np.ndarray,
                 solution: np.ndarray, residual: np.ndarray) -> float:
-        """solution += length direction, residual -= length applied; returns <residual, inverse residual>."""
+        """solution += length direction, residual -= length applied; returns <residual, inverse * residual>."""
         return self._call("modes_descend", ctypes.c_double, [length, inverse], [direction, applied, solution, residual])
 
     def update_direction(self, beta: float, inverse: np.ndarray, residual: np.ndarray, direction: np.ndarray) -> None:
-        """direction = inverse residual + beta direction."""
+        """direction = inverse * residual + beta * direction."""
         self._call("modes_turn", None, [beta, inverse], [residual, direction])
 
     def _call(self, name: str, result: type | None, given: list, vectors: list[np.ndarray]) -> float:

@@ -122,9 +122,9 @@ class Training:
 
     @property
     def cost(self) -> list[dict[str, Any]]:
-        """A row for each finished phase: name `phase`, optimiser `steps`, wall `seconds` with validations, and `error`.
+        """A row for each finished phase: `phase`, its name; `steps`; wall `seconds` including validations; and `error`.
 
-        The error is the validation error of the weights at its end, None without validation.
+        The error is the validation error of the weights at the end of the phase; None without validation.
         """
         finished, before = [], 0.0
         for number, phase in enumerate(self.phases[:self.phase_number]):

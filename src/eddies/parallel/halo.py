@@ -10,7 +10,7 @@ from eddies.parallel.slab import SlabDecomposition
 
 
 class HaloError(UserError, ValueError):
-    """A slab is thinner than the halo, or a particle is outside the halo."""
+    """A slab is thinner than the halo, or a particle is not finite or too far outside its slab for the ghosts."""
 
 
 class HaloExchange:

@@ -64,7 +64,7 @@ def migrate(decomposition: SlabDecomposition, columns: dict[str, np.ndarray]) ->
     """Return all columns of a particle set after each particle has moved to the slab that contains it.
 
     `columns` holds at least `id` (n,) and `position` (n, 3); positions are wrapped into the box first. Raises
-    ParticleLossError if the number of particles, the id sum or the id parity changes.
+    ParticleLossError if the number of particles, the sum of the ids or their exclusive-or changes.
     """
     columns = {**columns, "position": wrap(columns["position"], decomposition.length)}
     if decomposition.size == 1:

@@ -35,10 +35,10 @@ class SmoothingKernel(Protocol):
 
     @property
     def pieces(self) -> Tensor:
-        """W(r) in equally long pieces of 0 <= r < support, (pieces, coefficients).
+        """Polynomial coefficients of W(r) on equal intervals of 0 <= r < support, (intervals, coefficients).
 
-        The coefficients belong to u^0, u^1, ..., where u falls from 1 to 0 along a piece: near the support, where u is
-        small, they cancel least.
+        They belong to u^0, u^1, ..., where u falls from 1 to 0 along an interval: near r = support, where u is small,
+        the terms cancel least.
         """
 
     def value(self, distance: Tensor) -> Tensor: ...

@@ -158,7 +158,7 @@ def energy_spectra(series: Sequence[SpectraAt], flow: Mapping[str, np.ndarray], 
 
 @styled
 def path_statistics(model: PathStatistics, truth: PathStatistics, turnover: float) -> Figure:
-    """Draw correlations and increments of velocities, accelerations, and the spreading of pairs and tetrads."""
+    """Draw statistics of velocity and acceleration along paths, dispersion of pairs, and size and shape of tetrads."""
     figure, axes = panels(3, 3, (3.6, 2.6))
     (memory, structure, accelerations), (variance, flatness, pairs), (sizes, shapes, unused) = axes
     for run, name in ((truth, "truth"), (model, "model")):

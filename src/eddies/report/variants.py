@@ -82,7 +82,7 @@ class ErrorAgainstTime:
         return [sentence for sentence in sentences if sentence]
 
     def finished(self, measure: str) -> list[Row]:
-        """Rows of stable variants that have this measure and a time."""
+        """Rows of stable variants that have this measure and a run time."""
         return [row for row in self.rows if is_stable(row) and None not in (row[measure], row[COST])]
 
     def stopped(self) -> list[Row]:
@@ -114,7 +114,8 @@ def _notice(row: Row) -> str:
 
 
 def _with_spread(row: Row, column: str) -> Any:
-    """Return a number of a row, with its standard deviation over realisations if there is one."""
+    """Return a number of a row, with its standard deviation over realisations if known; "not stored" for the cost of a
+    training that the file of the model lacks."""
     if column in ("training_seconds", "training_steps") and row[column] is None and row["weights"] is not None:
         return "not stored"
     spread = row.get(f"{column}_spread")

@@ -90,7 +90,7 @@ def section(sections: Mapping[str, Section], warned: bool) -> Section:
         text.append("A forced flow differs from its truth after one or two turnovers. The section on the stationary "
                     "state compares its averages.")
     if warned:
-        text.append("Read the warnings above first: these numbers may not belong together.")
+        text.append("Read the warnings of this report first: these numbers may not belong together.")
     return Section(KEY, "Verdict", " ".join(text), metrics=[each.metric for each in of_rollout + of_model + of_kernel])
 
 
@@ -101,7 +101,7 @@ def _sentences(numbers: Mapping[str, Any], judged: Sequence[Judged]) -> Iterator
         return
     if not numbers.get("stable"):
         status = numbers.get("status")
-        fault = "is not finite to its end" if status == "complete" else f"did not reach its end ({status})"
+        fault = "has values that are not finite" if status == "complete" else f"did not reach its end ({status})"
         yield f"Poor: the rollout {fault}. Only earlier frames are compared."
     if not judged:
         yield ("The rollout is not judged against the true tracers: its forcing differs from theirs, so they are in "
@@ -143,7 +143,7 @@ def _model(numbers: Mapping[str, Any]) -> Iterator[Judged]:
     if error is not None:
         baseline, baseline_text = 1.0, "no model: 1"
         if gradient is not None and gradient < 1:
-            baseline, baseline_text = gradient, f"exact filtered pressure gradient: {gradient:.2g}"
+            baseline, baseline_text = gradient, f"with the exact filtered pressure gradient: {gradient:.2g}"
         yield Judged("acceleration_error", "model: acceleration error at the true state",
                      "acceleration error at the true state", error, error,
                      *(limit * baseline for limit in BESIDE_GRADIENT), baseline_text)

@@ -230,9 +230,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             "turnovers": span / stretches[0].turnover})
         for name, table in tables.items():
             write_table(file, f"trials/{name}", table)
-    log.info("find-step: found %s with %s %.4g, %.3g s per turnover. Half of it changes the velocity by %.4f and has "
-             "the error %.4f", found.step.integrator, "Courant number" if settings.on_grid else "step", found.step.size,
-             found.seconds, difference, half.error)
+    log.info("find-step: found %s with %s %.4g, %.3g s per turnover. With half this value the velocity changes by "
+             "%.4f of its rms, and its error is %.4f", found.step.integrator,
+             "Courant number" if settings.on_grid else "step", found.step.size, found.seconds, difference, half.error)
 
 
 def integrators(settings: Simulation, span: float) -> Iterator[tuple[str, float, int]]:
@@ -247,7 +247,7 @@ def integrators(settings: Simulation, span: float) -> Iterator[tuple[str, float,
 
 
 def short_rollout(method: Method, step: TimeStep, stretch: Stretch, stop: StopRequest) -> Trial:
-    """Advance a method with a step through a stretch of the ground truth; collective. Raises Stopped on request."""
+    """Advance a method through a stretch of the ground truth with this time step; collective. Raises Stopped."""
     comm, total = stretch.truth.decomposition.comm, stretch.truth.total
     method.frame(0.0)  # the rates at the start, which the first step uses
     began, number, complaint = time.perf_counter(), 0, None

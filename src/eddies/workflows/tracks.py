@@ -56,8 +56,8 @@ def with_tracks(scene: Scene, comm: Comm) -> Scene:
     found = in_files(comm, settings.file, lambda: _sections_of(settings, learned))
     for name, own in found.items():
         if getattr(scene, name) not in (None, own):
-            raise SceneError(f"[{name}]: does not fit [tracks], which takes the place of this section; remove it, in the "
-                             f"scene of a run by --unset {' --unset '.join(found)}")
+            raise SceneError(f"[{name}]: does not fit [tracks], which takes the place of this section; remove it, in "
+                             f"the scene of a run by --unset {' --unset '.join(found)}")
     return replace(scene, **found, variant={name: replace(each, **found) for name, each in scene.variant.items()})
 
 

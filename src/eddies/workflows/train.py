@@ -51,9 +51,10 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         data, tests = training_data(definition, settings, trained_on), evaluation_frames(truth)
         model, dtype = data[0].model, data[0].dtype
         for each in data:
-            log.info("train: %d parameters; trains on frames up to %d; the next %d, up to the end of the training "
-                     "window at t = %.3g of %.3g, are for validation", sum(p.numel() for p in model.parameters()),
-                     each.learned, each.last - each.learned, each.truth.times[each.last], each.truth.times[-1])
+            log.info("train: %d parameters; trains on frames up to %d and keeps the next %d for validation; the "
+                     "training window ends at t = %.3g, the ground truth at t = %.3g",
+                     sum(p.numel() for p in model.parameters()), each.learned, each.last - each.learned,
+                     each.truth.times[each.last], each.truth.times[-1])
         own = next((each.model for each in data if each.truth is truth), None)
         # If the model is trained on other ground truths only, it has seen no part of the run's own.
         last = last_seen(settings.window if own is not None else 0.0, len(truth.times))
@@ -86,11 +87,12 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     if curves is not None:  # after the product is written: a failing picture must not lose it
         curves.draw(training)
     errors = tables["a_priori"]
-    beside = (f" (exact filtered pressure gradient {errors['pressure_gradient_error'][-1]:.3f})"
+    beside = (f" (with the exact filtered pressure gradient: {errors['pressure_gradient_error'][-1]:.3f})"
               if "pressure_gradient_error" in errors else "")
-    since = "training window" if own is not None else "release of the tracers; trained on other ground truths"
-    log.info("model: a-priori acceleration error %.3f%s, a time of %.3g after the %s", errors["acceleration_error"][-1],
-             beside, errors["delay"][-1], since)
+    since = ("end of the training window" if own is not None
+             else "release of the tracers; trained on other ground truths")
+    log.info("model: a-priori acceleration error %.3f%s, measured at a time %.3g after the %s",
+             errors["acceleration_error"][-1], beside, errors["delay"][-1], since)
 
 
 class LearningCurves:

@@ -162,7 +162,8 @@ def notes(scene: Scene) -> list[str]:
     if grids:
         kept = ", ".join(f"{(cells - 1) // 3} in {name}" for name, cells in grids.items())
         widths = {variants[name].tracers.filter_width for name in grids}
-        found.append(f"Largest wavenumber |k_i| that a grid keeps by the 2/3 rule: {kept}; k_d = "
+        found.append(f"Largest wavenumber |k_i| that a grid keeps by the 2/3 rule: {kept}; the filter wavenumber "
+                     f"k_d = pi/d is "
                      f"{', '.join(f'{np.pi / width:.3g}' for width in sorted(widths, reverse=True))}.")
     if len({(variant.tracers.particles, variant.tracers.filter_width) for variant in variants.values()}) > 1:
         found.append("Variants have different particles or filters. Compare only those with the same ones.")

@@ -67,7 +67,7 @@ class Continuity(_SPHTerm):
             "|delta|", self.delta.abs(), "diffusivity 2 |delta| h c of the density", "L^2/T", self.diffusivity)]
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
-        """m v.grad W and, with diffusion, m (rho_j - rho_i) W'/r, both over rho_i rho_j: (components, m)."""
+        """m (v_i - v_j).grad W and, with diffusion, m (rho_j - rho_i) W'/r, each divided by rho_i rho_j."""
         listed, (own, other) = pairs.pairs, self.densities(pairs)
         slope = self.slope(listed) / (own * other)
         values = [slope * (listed.displacement.T * pairs.velocity_difference).sum(0)]

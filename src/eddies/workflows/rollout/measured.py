@@ -106,7 +106,8 @@ class MeasuredRollout:
     ----------
     rollout : the rollout and its truth. provenance : of its product.
     directory : the run directory.
-    fields, solver : make reconstructions and spectra of particles. None without a kernel, or a ground truth.
+    fields : reconstructs fields of particles; None without a kernel or a ground truth.
+    solver : makes spectra of particles; None without a ground truth.
     stationary : whether the ground truth has a stationary state.
     """
 

@@ -149,8 +149,8 @@ class ParticleRun:
         # Logged once; the report gives the number.
         if 0 < failed == sum(self._solves["not_converged"]) and self.comm.rank == 0:
             log.warning("rollout: %d of %d solves for the resolved velocity did not converge in %d iterations; the "
-                        "largest residual is %.1e. The report gives the total number", failed, len(solves),
-                        max(iterations), residuals.max())
+                        "largest residual is %.1e. Later ones are not logged; the report counts all", failed,
+                        len(solves), max(iterations), residuals.max())
 
     def status(self) -> str:
         """Mean iterations of a solve for the resolved velocity between the last two frames, for the progress line."""
