@@ -25,6 +25,7 @@ TRANSFORM, CACHED, SINGLE, PAIR, TRACER, WEIGHT = 4e-9, 550, 0.65, 2.5e-8, 200, 
 CALL, MESSAGE, ROUNDS = 2.5e-4, 2e-6, 4
 START = {"dns": 0.4, "train-kernel": 0.7, "reconstruct": 1.0, "train": 1.0, "find-step": 0.5, "simulate": 0.3,
          "report": 2.3}
+DERIVATIVES = 3              # cost of a neighbour in kriging of all derivatives at particles, in averages
 FORM_PAIRS = {"average": 1, "linear": 1.5, "quadratic": 2.5, "kriging": 6}  # cost of a neighbour, in averages
 SEARCH, CONFIRM = 2, 0.75    # turnovers of the rollouts of a search, and of those on each further ground truth
 COLD, ITERATION = 25, 12     # iterations of a solve without a first guess; transforms of a point in each
@@ -77,6 +78,8 @@ def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
         if rollout is None:
             return None
         calls, pairs = rollout.evaluations, rollout.evaluations * tracers.particles * neighbors / 2
+        if model and "filtered-equations" in model.settings and "model" in scene.simulation.needs:
+            pairs *= 2 * DERIVATIVES
         if scene.coarse_cells:
             calls = rollout.steps * ETDRK4.evaluations
             transforms = calls * CompressibleFluid.transforms * scene.coarse_cells**3
@@ -96,4 +99,4 @@ def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
     whole += calls * (CALL + ROUNDS * (ranks - 1) * MESSAGE)
     if stage == "find-step":
         whole *= (SEARCH + CONFIRM * len(scene.simulation.confirming_files)) / scene.simulation.turnovers
-    return START[stage] + whole
+    return START[stage] / (ranks if stage == "report" else 1) + whole  # pages are shared out
