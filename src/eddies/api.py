@@ -82,8 +82,8 @@ def _job(comm: Comm | None) -> Iterator[Comm]:
     """The communicator of a job, by default the one of all ranks.
 
     Log lines go to standard output unless the program has set up logging. With several ranks, MPI_Abort ends the job
-    if only some of them meet an error, because the others may wait for them, and if HDF5 could not write a file,
-    because HDF5 then crashes at exit.
+    in two cases. Either only some ranks meet an error, and the others may wait for them. Or HDF5 could not write a
+    file, and would crash at exit.
     """
     default_to_one_thread()
     from mpi4py import MPI

@@ -97,7 +97,7 @@ def add_command(commands: argparse._SubParsersAction, name: str, about: str) -> 
 
 
 def add_run(parser: argparse.ArgumentParser, name: str, nargs: str | None = None) -> None:
-    """Add a run directory."""
+    """Add an argument for a run directory."""
     parser.add_argument(name, type=directory, metavar="RUN", nargs=nargs, help="a run directory, such as runs/tiny")
 
 
@@ -125,7 +125,7 @@ def positive(text: str) -> float:
 
 
 def add_scene_options(parser: argparse.ArgumentParser) -> None:
-    """Add the scene and changes to it."""
+    """Add the arguments for a scene and for changes to it."""
     parser.add_argument("scene", metavar="SCENE", help="name of a built-in scene, or path of a TOML file")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", dest="overrides",
                         help="change a key of the scene; repeatable")

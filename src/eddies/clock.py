@@ -54,14 +54,14 @@ class Clock:
 
 
 def ladder_step(largest: float, bound: float) -> float:
-    """The largest of largest * 2^-m, m = 0, 1, ..., that does not exceed `bound`."""
+    """The largest of largest * 2^-m, m = 0, 1, ..., that does not exceed `bound`. ValueError if it is not above 0."""
     if not bound > 0:
         raise ValueError(f"time step bound {bound} is not positive: the flow is no longer finite")
     return largest if bound >= largest else largest * 2.0 ** -math.ceil(math.log2(largest / bound))
 
 
 class ProgressLine:
-    """Logs a line every few seconds of wall time, with --verbose after every step: progress and remaining time. Call it
+    """Logs progress and remaining time, every few seconds of wall time or, with --verbose, after every step. Call it
     after every step.
 
     The seconds per step are a median, without the first two steps and without the time of `storing`, whose share of the
@@ -70,10 +70,10 @@ class ProgressLine:
     Parameters
     ----------
     stage : first word of the line.
-    describe : returns the state of the stage as text. It must not communicate: it is called on ranks that log.
+    describe : returns the state of the stage as text. It must not communicate, because only ranks that log call it.
     interval : wall seconds between two lines.
     done : fraction of the stage that an earlier job has done, which does not count for the remaining time.
-    unit : what is counted.
+    unit : name of what is counted.
     """
 
     def __init__(self, stage: str, describe: Callable[[], str], interval: float = 5.0, done: float = 0.0,

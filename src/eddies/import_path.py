@@ -33,7 +33,7 @@ def short_name(name: str) -> str:
 
 
 def search_in(folder: str | Path) -> None:
-    """Search for modules of import paths in a folder too, after all other places."""
+    """Let import paths find modules in this folder too, after all other places."""
     folder = str(Path(folder).resolve())
     if folder not in sys.path:
         sys.path.append(folder)
@@ -62,7 +62,7 @@ def load(path: str) -> Any:
 
 @contextmanager
 def users_code(called: Any, problem: type[UserError], hint: str = "") -> Iterator[None]:
-    """Convert an exception of a user's class or function into a `problem` with its name, file and line.
+    """Convert an exception of a user's class or function `called` into a `problem` with name, file and line.
 
     Errors of this package and of its own classes pass unchanged. `hint` is added to the end of the text.
     """

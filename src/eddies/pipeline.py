@@ -11,13 +11,13 @@ class Stage:
     ----------
     name : name of the stage and of its command.
     about : its result, for the help.
-    section : the section of a scene that asks for it; None if it is always run.
+    section : the section of a scene that asks for the stage; None if the stage is always run.
     product : kind of its product PRODUCT.h5 in the run directory; None without one.
     reads : sections and properties of a scene on which its product depends, besides those of the stages before it (see
         workflows/run_directory/fingerprints.py).
     depends_on : all stages on which its product depends, if the scene has them.
     checkpoints : directory of its checkpoints in the run directory; None without checkpoints.
-    but : keys "section.key" in `reads` on which its product does not depend.
+    but : keys "section.key" of sections in `reads` on which its product does not depend.
     """
 
     name: str

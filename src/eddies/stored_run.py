@@ -56,7 +56,7 @@ class StoredRun:
         return found + [name for name in MADE if name not in found and "rollout" in self.products]
 
     def __getitem__(self, name: str) -> Any:
-        """A group of arrays: "PRODUCT/GROUP"."""
+        """The group of arrays with the name "PRODUCT/GROUP"."""
         from eddies.io.datasets import open_group
         product, _, group = name.partition("/")
         if product not in self.products:
@@ -142,7 +142,7 @@ class StoredRun:
         return found
 
     def field(self, name: str = "velocity", time: float | None = None, of: str = "filtered") -> Any:
-        """A field on its grid, (component, z, y, x), at the stored time nearest to `time`, or the last.
+        """A field on its grid, (component, z, y, x), at the stored time nearest to `time`; None for the last one.
 
         `of` is "filtered" or "unfiltered" for the flow, "final" for a run without tracers, "reconstructed" for the
         fields of [reconstruction], or "model" or "truth" for the field that the kernel makes from the particles.
@@ -150,7 +150,7 @@ class StoredRun:
         return at_time(self[chosen(FIELDS, of)], name, time)
 
     def spectrum(self, of: str = "model", time: float | None = None) -> Any:
-        """Energy spectrum at the stored time nearest to `time`, or the last.
+        """Energy spectrum at the stored time nearest to `time`; None for the last one.
 
         `of` is "flow" or "filtered", or "model" or "truth" for the spectrum of a least-squares fit to the velocities of
         the particles.
@@ -203,8 +203,8 @@ def check_ids(ids: np.ndarray, count: int) -> None:
 
 
 def at_time(found: Any, name: str, time: float | None) -> Any:
-    """A variable at the stored time nearest to `time`, or the last. Raises UserError for an unknown variable, and for a
-    time more than an interval before the first or after the last."""
+    """A variable at the stored time nearest to `time`; None for the last one. Raises UserError for an unknown variable,
+    and for a time outside the stored times by more than their longest interval."""
     if name not in found or name == "time":
         raise UserError(f'"{name}": no such variable; there are {", ".join(key for key in found if key != "time")}')
     times = np.asarray(found["time"])

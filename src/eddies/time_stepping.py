@@ -59,7 +59,7 @@ def divided_difference(function: ScalarFunction, first: np.ndarray, second: np.n
 
 
 class ETDRK4:
-    """Fourth-order exponential time differencing (Cox and Matthews 2002, Eqs. 26-29): L exact, N by Runge-Kutta.
+    """Fourth-order exponential time differencing (Cox and Matthews 2002, Eqs. 26-29): exact in L, Runge-Kutta in N.
 
     The operators f(step L) are kept for each step size, so the number of different step sizes should be small.
     """
@@ -98,7 +98,7 @@ class ETDRK4:
 
 
 class RungeKutta4:
-    """The classical explicit fourth-order method, for L and N alike: the reference for error against run time."""
+    """The classical explicit fourth-order method for L and N alike, for comparisons of error and run time."""
 
     evaluations = 4
 

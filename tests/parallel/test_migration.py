@@ -60,7 +60,7 @@ def test_what_happens_to_a_particle_on_its_way_is_noticed_by_all_ranks(comm, mon
 
     monkeypatch.setattr(Redistribution, "apply", spoiled)
     columns, _ = scattered(comm, 40)
-    with pytest.raises(ParticleLossError, match="id parity"):
+    with pytest.raises(ParticleLossError, match="exclusive-or of ids"):
         migrate(SlabDecomposition(comm, LENGTH, 7), columns)
 
 

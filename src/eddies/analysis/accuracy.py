@@ -13,12 +13,12 @@ from eddies.measures import MEASURES
 
 
 def accuracy(run: Rollout) -> dict[str, float | None]:
-    """All MEASURES, and `end`, the last common time over T. A measure at a time that rollout or truth does not reach
-    is None.
+    """All MEASURES, and `end`, the last common time divided by T. A measure is None if rollout or truth does not reach
+    its time.
 
-    Velocity errors are normalised L2 norms by particle, interpolated linearly between frames. Measures at the end are
-    taken at the last common frame, Lagrangian statistics over all common frames. Both are None for a rollout that is
-    not complete, because it ends earlier than others.
+    Velocity errors are normalised L2 norms of the differences by particle, interpolated linearly between frames.
+    Measures at the end are taken at the last common frame, and Lagrangian statistics over all common frames. Both
+    groups are None for a rollout that is not complete, because it ends earlier than others.
     """
     measures: dict[str, float | None] = dict.fromkeys(MEASURES)
     try:

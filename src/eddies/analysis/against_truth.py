@@ -53,7 +53,7 @@ def pdf_divergence(pair: Pair, edges: np.ndarray) -> float:
 def sampling_floor(pair: Pair, edges: np.ndarray) -> float:
     """Expected divergence of this PDF between two independent samples of the truth.
 
-    A model whose particles are still near the true ones can be below it.
+    A model whose particles are still near the true ones can have a smaller divergence.
     """
     values = standardized(pair.truth)
     return sampling_divergence(len(values), lambda rows: bin_probabilities(values[rows], edges))

@@ -33,7 +33,7 @@ class Blocks:
 
     @classmethod
     def of(cls, times: np.ndarray, shortest: float) -> "Blocks":
-        """As many equal blocks as possible that are at least `shortest` long, or one. Empty blocks are left out."""
+        """As many equal blocks as possible, each at least `shortest` long; at least one. Empty blocks are left out."""
         span = float(times[-1] - times[0])
         count = max(min(int(span / shortest + 1e-9), len(times)), 1)
         block = ((times - times[0]) * (count / max(span, 1e-300)) + 1e-9).astype(int).clip(max=count - 1)
@@ -45,7 +45,7 @@ class Blocks:
         return np.array([samples[rows].mean(axis=0) for rows in self.members])
 
     def mean(self, samples: np.ndarray) -> Estimate:
-        """Mean of samples (n,) over the blocks; error: standard deviation of the blocks' means over sqrt(blocks)."""
+        """Mean of samples (n,) over blocks; error: standard deviation of the block means divided by sqrt(blocks)."""
         return self.of_mean(samples, float)
 
     def of_mean(self, samples: np.ndarray, function: Callable[[np.ndarray], float]) -> Estimate:

@@ -79,7 +79,7 @@ def count_variance_series(frames: Frames, chosen: Sequence[int], length: float) 
 def momentum_drift(start: np.ndarray, end: np.ndarray) -> float:
     """|<v(end)> - <v(start)>| / u' of velocities (n, 3), u' the rms of a component about its mean at the start.
 
-    Tracers of a flow that keeps its momentum have a drift of order n^(-1/2): they are a sample of the flow.
+    Tracers of a flow that keeps its momentum have a drift of order n^(-1/2), because they are a sample.
     """
     start, end = (velocity.astype(float) for velocity in (start, end))
     return float(np.linalg.norm(end.mean(0) - start.mean(0)) / np.std(start - start.mean(0)))
@@ -92,10 +92,9 @@ def mean_drift(start: np.ndarray, end: np.ndarray) -> float:
 
 
 def drifts(run: Rollout) -> dict[str, dict[str, float]]:
-    """Drifts from the first to the last common time, by name, for "model" and "truth".
+    """Drifts from the first to the last common time, and the count variance at the last; each for "model" and "truth".
 
-    They are `momentum_drift`, `count_variance` at the last time and, for a model that integrates a density,
-    `density_drift`.
+    Names are `momentum_drift`, `count_variance` and, for a model that integrates a density, `density_drift`.
     """
     columns = {"momentum_drift": ("velocity", momentum_drift)}
     if run.attributes.get("integrates_density", False):

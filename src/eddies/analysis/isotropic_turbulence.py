@@ -63,8 +63,8 @@ def modes_per_shell(largest: int) -> np.ndarray:
 class Row:
     """A quantity of this flow and its value in the literature.
 
-    `deviation` is its standard deviation in time, None if it is not an average. `error` is its standard error, None if
-    the average is over fewer than two turnovers.
+    `deviation` is the standard deviation of the quantity in time; None if the value is not an average. `error` is the
+    standard error of the value; None if the average is over fewer than two turnovers.
     """
 
     key: str
@@ -81,11 +81,11 @@ class StationarySpan:
 
     Parameters
     ----------
-    statistics : columns (samples,) of a ground truth's table.
+    statistics : columns (samples,) of the table `statistics` of a ground truth.
     spectra : E(k) at every sample, (samples, shells), k = 0, 1, ...
     viscosity : kinematic viscosity.
     start, end : first and last time.
-    forced_below : modes with 0 < |k| < this are forced; 0 without forcing.
+    forced_below : modes with 0 < |k| < forced_below are forced; 0 without forcing.
 
     Raises ValueError if the span holds fewer than three samples.
     """
@@ -175,7 +175,7 @@ class StationarySpan:
         return -(destroyed + growth) / (17.5 * (enstrophy / 15) ** 1.5)
 
     def component_shares(self) -> np.ndarray:
-        """Energy of each velocity component over the mean of the three, (3, samples)."""
+        """Energy of each velocity component divided by the mean of the three, (3, samples)."""
         energies = np.array([self.columns[name] for name in COMPONENTS])
         return energies / energies.mean(axis=0)
 

@@ -25,15 +25,16 @@ class PathStatistics:
 
     Parameters
     ----------
-    times : of the frames, (m,). lags : in units of time, (l,).
+    times, lags : times of the frames, (m,), and lags in units of time, (l,).
     structure, flatness : <dv^2> and <dv^4>/<dv^2>^2 of the increments dv of a velocity component over a lag, (l,).
-    velocity_correlation : with the velocities in the first frame, (m,).
-    acceleration_correlation : over the lags, (l,). acceleration_variance : of a component, (m,).
+    velocity_correlation : correlation of the velocities in each frame with those in the first frame, (m,).
+    acceleration_correlation : correlation of the accelerations in two frames that are a lag apart, (l,).
+    acceleration_variance : variance of an acceleration component, (m,).
     pair_dispersion : <|r(t) - r(0)|^2> / <r(0)^2> of nearest neighbours, (m,).
-    tetrad_size : <R^2> over its value at the start, of a particle and its three nearest neighbours: R^2 is the sum of
-        |x_i - x|^2, x the mean of the four positions; (m,).
-    tetrad_shape : mean eigenvalues of sum (x_i - x)(x_i - x)^T over R^2, the largest first; 1/3 each for a regular
-        tetrahedron (Chertkov, Pumir & Shraiman 1999); (m, 3).
+    tetrad_size : <R^2> divided by its value at the start, (m,). A tetrad is a particle and its three nearest
+        neighbours, and R^2 is the sum of |x_i - x|^2 with the mean x of the four positions.
+    tetrad_shape : mean eigenvalues of sum (x_i - x)(x_i - x)^T divided by R^2, the largest first, (m, 3); each is 1/3
+        for a regular tetrahedron (Chertkov, Pumir & Shraiman 1999).
     """
 
     times: np.ndarray
@@ -50,7 +51,7 @@ class PathStatistics:
 
 def of_both(model: Frames, truth: Frames, common: CommonFrames,
             length: float) -> tuple[PathStatistics, PathStatistics]:
-    """Statistics of model and truth over all common frames; tetrads are those of the truth in the first one."""
+    """Statistics of model and truth over all common frames. Both use the tetrads of the truth in the first frame."""
     tetrads = near_tetrads(truth.read(int(common.truth[0]), "position"), length)
     return (path_statistics(model, common.model, tetrads, length),
             path_statistics(truth, common.truth, tetrads, length))
@@ -89,7 +90,7 @@ def path_statistics(run: Frames, chosen: Sequence[int], tetrads: np.ndarray, len
 def differences(model: PathStatistics, truth: PathStatistics) -> dict[str, float]:
     """Errors of the model by name: rms of ln(model / truth) over lags or times.
 
-    Dispersion and tetrads leave out the first time, at which both are equal. The error of the correlation of
+    Dispersion and tetrads leave out the first time, when model and truth are equal. The error of the correlation of
     accelerations, which changes sign, is the rms of the difference.
     """
     def log_ratio(name: str, first: int = 0) -> float:
@@ -130,7 +131,10 @@ def _dispersion(run: Frames, chosen: Sequence[int], tetrads: np.ndarray,
 
 
 def tetrad_moments(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Size R^2 (g,) of tetrads (4, g, 3), and shape (g, 3): eigenvalues of second moments over R^2, largest first."""
+    """Size R^2 (g,) and shape (g, 3) of tetrads (4, g, 3).
+
+    The shape is the eigenvalues of the second moments divided by R^2, the largest first.
+    """
     offsets = corners - corners.mean(axis=0)
     eigenvalues = np.linalg.eigvalsh(np.einsum("cgi,cgj->gij", offsets, offsets))[:, ::-1]
     size = eigenvalues.sum(axis=1)
@@ -146,7 +150,8 @@ def correlation(initial: np.ndarray, later: np.ndarray) -> float:
 def structure_function(velocity: Sequence[np.ndarray], lags: np.ndarray) -> np.ndarray:
     """Second-order Lagrangian structure function <|v(t + lag) - v(t)|^2> / 3 of a component, (m,).
 
-    velocity (frames, n, 3) at equal intervals, lags (m,) in frames; mean over particles and all start frames.
+    `velocity` is (frames, n, 3) at equal intervals; `lags` (m,) count frames. The mean is over particles and all start
+    frames.
     """
     return _over_lags(velocity, lags, lambda earlier, later: np.mean((later - earlier) ** 2))
 
@@ -173,7 +178,7 @@ def _over_lags(values: Sequence[np.ndarray], lags: np.ndarray,
 
 
 def minimum_image(displacement: np.ndarray, length: float) -> np.ndarray:
-    """Displacement of the nearest periodic image, any shape."""
+    """Displacements to the nearest periodic image; arrays of any shape."""
     return displacement - length * np.rint(displacement / length)
 
 
@@ -192,7 +197,10 @@ def separations(position: Iterable[np.ndarray], first: np.ndarray, second: np.nd
 
 
 def pair_dispersion(position: Iterable[np.ndarray], groups: Sequence[np.ndarray], length: float) -> np.ndarray:
-    """<|r(t) - r(0)|^2> of groups of pairs, rows (2, m), over frames of positions (n, 3): (groups, frames)."""
+    """<|r(t) - r(0)|^2> of each group of pairs in each frame, (groups, frames).
+
+    A group is given by the rows (2, m) of its pairs. `position` yields the positions (n, 3) of each frame.
+    """
     paths = separations(position, *np.concatenate(groups, axis=1), length)
     start, ends = next(paths), np.cumsum([pairs.shape[1] for pairs in groups])[:-1]
     spread = [[0.0] * len(groups)]

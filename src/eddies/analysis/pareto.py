@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-Method = Mapping[str, Any]  # `label`, a cost and errors by key (None: unknown), and KEY_spread: standard deviations
+Method = Mapping[str, Any]  # `label`; a cost and errors by KEY, None if unknown; their deviations, KEY_spread
 
 
 def pareto_front(cost: np.ndarray, error: np.ndarray) -> np.ndarray:
@@ -77,7 +77,7 @@ def cheapest_grid(model: Method, grids: Sequence[Method], cost: str, times: Mapp
 def break_even(first: float, each: float, rival_first: float, rival_each: float) -> float:
     """Turnovers after which a method has taken less time than a rival; infinite if its turnovers are not faster.
 
-    `first` are the seconds before the first turnover, `each` those of a turnover.
+    `first` is the time in seconds before the first turnover, `each` the time of one turnover.
     """
     if each >= rival_each:
         return math.inf

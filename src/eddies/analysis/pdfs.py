@@ -44,15 +44,15 @@ def kl_divergence(truth: np.ndarray, prediction: np.ndarray) -> float:
 def sampling_divergence(rows: int, probabilities: Callable[[np.ndarray], np.ndarray]) -> float:
     """Expected divergence between two independent samples of `rows` rows: the value of a perfect model.
 
-    It is half the divergence between two random halves of the sample, because it decreases as 1 / rows. `probabilities`
-    returns the bin probabilities of chosen rows.
+    It is half the divergence between two random halves of the sample, because a divergence decreases as 1 / rows.
+    `probabilities` returns the bin probabilities of chosen rows.
     """
     shuffled = np.random.default_rng(0).permutation(rows)
     return kl_divergence(*(probabilities(half) for half in np.array_split(shuffled, 2))) / 2
 
 
 def standardized(values: np.ndarray, reference: np.ndarray | None = None) -> np.ndarray:
-    """(values - mean) / standard deviation, both of `reference` (default: of the values)."""
+    """(values - mean) / standard deviation, both of `reference` (default: the values). ValueError if it is constant."""
     reference = values if reference is None else reference
     deviation = np.std(reference)
     if deviation == 0:

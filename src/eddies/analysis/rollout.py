@@ -10,8 +10,8 @@ import numpy as np
 from eddies.analysis.spectra import band_ratios, spectrum_error
 from eddies.analysis.velocity_gradients import Invariants
 
-SHOWN = 3   # spectra of a rollout in a report
-PLANES = 4  # planes of a rollout in a report
+SHOWN = 3   # largest number of times at which a report shows spectra of a rollout
+PLANES = 4  # largest number of times at which a report shows planes of a rollout
 Table = Mapping[str, np.ndarray]  # columns wavenumber (shells,), time (m,), energy or others (m, shells)
 
 
@@ -46,7 +46,7 @@ class CommonFrames:
         return cls(rows, columns, model.times[rows])
 
     def spread(self, count: int) -> np.ndarray:
-        """At most `count` positions in this list, evenly spread from the first to the last."""
+        """Indices of at most `count` common frames, evenly spread from the first to the last."""
         return _spread(np.arange(self.times.size), count)
 
 
@@ -89,7 +89,7 @@ class SpectraAt:
         return spectrum_error(getattr(self, of), self.filtered, self._largest(filter_wavenumber))
 
     def bands(self, of: str, filter_wavenumber: float) -> dict[str, float]:
-        """`band_ratios` of "model" or "truth" to the filtered flow, up to the same wavenumber."""
+        """`band_ratios` of "model" or "truth" to the filtered flow, up to k_d or the last shell."""
         return band_ratios(getattr(self, of), self.filtered, self._largest(filter_wavenumber))
 
     def _largest(self, filter_wavenumber: float) -> float:
@@ -102,16 +102,17 @@ class Rollout:
 
     Parameters
     ----------
-    attributes : of the group `rollout` of the product.
+    attributes : attributes of the group `rollout` of the product.
     model, truth : particles, at times since the start of the rollout. The truth may end earlier. Without a ground truth
         it has no frames, and `without_truth` gives the reason.
     length : edge of the box.
     flow : table `spectra` of the ground truth, with `energy` and `filtered`. Its times and `start_time` count from the
         release of the tracers.
     reference : scales of the ground truth.
-    spectra : energy (shells,) by frame, of "model" and "truth", from a least-squares fit of modes to the velocities.
-    invariants, planes : of the reconstructed velocity gradient at the particles, and of the reconstructed field; by
-        frame, of "model" and "truth". None without a kernel.
+    spectra : for "model" and "truth", the energy (shells,) by frame, from a least-squares fit of modes to velocities.
+    invariants : for "model" and "truth", the invariants of velocity gradients at the particles, by frame. None
+        without a kernel, which reconstructs the gradients.
+    planes : for "model" and "truth", a plane of the reconstructed field, by frame. None without a kernel.
     outside_training : share of the pairs outside the training range, (frames,); None if it was not counted.
     closure : columns (frames,) about the solves for the resolved velocity; None if there were none.
     reconstructed_by : the form of the reconstructions in words.
@@ -186,7 +187,7 @@ class Rollout:
         return np.flatnonzero(getattr(self, of).times < self.broken)
 
     def pair(self, index: int, column: str) -> Pair:
-        """A column of both at a common frame, rows in order of id."""
+        """A column of model and truth at a common frame, rows in order of id."""
         common = self.common
         return Pair(float(common.times[index]), self.model.read(int(common.model[index]), column),
                     self.truth.read(int(common.truth[index]), column))
@@ -212,8 +213,8 @@ class Rollout:
     def late_spectra(self) -> np.ndarray:
         """Frames of the model over which its spectrum is averaged, in the second half before it broke.
 
-        Either the spectrum of the flow is stored at the time of such a frame, or the truth has no frame at this time.
-        If the second half has no such frame, the last one before it is used.
+        A frame is used if the spectrum of the flow is stored at its time, or if the truth has no frame at this time.
+        If the second half has no such frame, the last such frame before it is used.
         """
         times = self.model.times
         chosen = self._has_flow(times) | ~_contained(times, self.truth.times)
@@ -221,7 +222,10 @@ class Rollout:
         return frames[second_half(times[frames], float(times[self.before_broken("model")[-1]]))]
 
     def spectra_at(self, index: int) -> SpectraAt:
-        """Spectra at a common frame, in the shells that all have. That of the flow is from the nearest time."""
+        """Spectra at a common frame, in the shells that all have.
+
+        The spectrum of the filtered flow is the one at the nearest stored time.
+        """
         common = self.common
         model, truth = self.both(self.spectra, index)
         nearest = int(np.argmin(np.abs(self.flow["time"] - (self.start_time + common.times[index]))))

@@ -6,16 +6,16 @@ from eddies.analysis.errors import rms_log_ratio
 
 
 def spectrum_error(energy: np.ndarray, reference: np.ndarray, largest_wavenumber: float) -> float:
-    """Root mean square of ln(E(k) / E_reference(k)) over the shells 1 <= k <= largest_wavenumber, at least the first.
+    """Root mean square of ln(E(k) / E_reference(k)) over the shells 1 <= k <= largest_wavenumber, at least over k = 1.
 
-    energy and reference: (shells,), from k = 0 on. Not finite if a shell of either is empty.
+    `energy` and `reference` are (shells,), from k = 0 on. Not finite if one of them has an empty shell.
     """
     shells = slice(1, _last_shell(largest_wavenumber) + 1)
     return rms_log_ratio(energy[shells], reference[shells])
 
 
 def band_ratios(energy: np.ndarray, reference: np.ndarray, largest_wavenumber: float) -> dict[str, float]:
-    """Ratio of energies in the bands of shells 1-2, 3-4, 5-8, 9-16, ... up to largest_wavenumber, by name."""
+    """Ratio of `energy` to `reference` in the bands of shells 1-2, 3-4, 5-8, ... up to largest_wavenumber, by band."""
     last, ratios, first, end = _last_shell(largest_wavenumber), {}, 1, 2
     while first <= last:
         end = min(end, last)

@@ -21,7 +21,10 @@ EDGES = bin_edges(12, 120)  # bins of the PDF of accelerations, in standard devi
 
 @dataclass(frozen=True)
 class Dispersion:
-    """Pairs that start `distance` apart: <|r(t) - r(0)|^2> (frames,), and <|v_1 - v_2|^2> at the start."""
+    """The number of `pairs` that start `distance` apart, and two means over them.
+
+    `spread` is <|r(t) - r(0)|^2>, (frames,). `structure` is <|v_1 - v_2|^2> at the start.
+    """
 
     distance: float
     pairs: int
@@ -39,8 +42,8 @@ class TracerStatistics:
     energy_error : standard deviation of this ratio for the same number of random points, (fields,).
     probability : PDF (bins,) on EDGES of an acceleration component in units of its rms at the time, from differences of
         successive frames.
-    kurtosis : of this PDF; 3 if it is Gaussian.
-    acceleration_rms : of a component, over the first interval.
+    kurtosis : kurtosis of this PDF; 3 if it is Gaussian.
+    acceleration_rms : rms of an acceleration component over the first interval.
     structure : Lagrangian structure function at the times `lags`.
     """
 

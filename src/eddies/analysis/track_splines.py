@@ -31,9 +31,9 @@ class SmoothedTracks:
 
     Parameters
     ----------
-    rows : number of each row in the tracks that were given; tracks with fewer than three rows are left out.
-    position : continuous along a track, (rows, 3). velocity, acceleration : (rows, 3).
-    smoothing : mu.
+    rows : index of each row in the arguments of `smooth`; tracks with fewer than three rows are left out.
+    position, velocity, acceleration : (rows, 3). Positions are continuous along a track.
+    smoothing : mu of the splines.
     """
 
     rows: np.ndarray
@@ -50,7 +50,7 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
     Parameters
     ----------
     time, track : (rows,), in any order. position : (rows, 3), wrapped or not.
-    edge : of a periodic cube; None: there is none. Particles move by less than half of it between two rows of a track.
+    edge : edge of a periodic cube, or None. Particles must move by less than half an edge between rows of a track.
     noise : standard deviation of the error of a coordinate. It determines mu: the squared residuals sum up to noise^2
         times their degrees of freedom.
     """
@@ -73,7 +73,7 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
 
 
 class Fit:
-    """The splines of tracks with the same times (n,) and positions (tracks, n, 3); `interval` is h of the penalty."""
+    """The splines of tracks with the same times (n,). Positions are (tracks, n, 3); `interval` is h of the penalty."""
 
     def __init__(self, times: np.ndarray, positions: np.ndarray, interval: float) -> None:
         self.times, self.tracks = times, len(positions)
@@ -96,7 +96,7 @@ class Fit:
         return BSpline(self._knots, solveh_banded(bands, right, lower=True), DEGREE)
 
     def residual(self, smoothing: float) -> tuple[float, float]:
-        """Sum of the squared residuals, and their degrees of freedom: number of values minus those of the splines."""
+        """Sum of squared residuals, and its degrees of freedom: number of values minus those of the splines."""
         squares = float(np.sum((self.spline(smoothing)(self.times) - self._values) ** 2))
         influence = self.spline(smoothing, np.eye(len(self.times)))(self.times)
         return squares, 3 * self.tracks * (len(self.times) - float(np.trace(influence)))
@@ -129,7 +129,7 @@ def _smoothing_of(fits: list[Fit], noise: float) -> float:
 
 
 def _unwrapped(positions: np.ndarray, edge: float | None) -> np.ndarray:
-    """Continuous positions (tracks, n, 3) from those in a periodic cube; `edge` None: no periodic cube."""
+    """Make positions (tracks, n, 3) in a periodic cube continuous. If `edge` is None, return them unchanged."""
     if edge is None:
         return positions
     moved = np.diff(positions, axis=1)

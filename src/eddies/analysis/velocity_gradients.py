@@ -47,14 +47,14 @@ def vieillefosse_line(third_invariant: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class InvariantBins:
-    """Bins of the plane, shared by model and truth: edges of Q / <Q_w> and of R / <Q_w>^(3/2)."""
+    """Bins of the Q-R plane, shared by model and truth: edges of Q / <Q_w> and of R / <Q_w>^(3/2)."""
 
     second: np.ndarray
     third: np.ndarray
 
     @classmethod
     def covering(cls, second: np.ndarray, third: np.ndarray, quantile: float = 0.999) -> "InvariantBins":
-        """Symmetric ranges that hold this fraction of the sample, in 12 to 64 bins, by the size of the sample."""
+        """Symmetric ranges that each hold this fraction of the sample, in 12 to 64 bins; larger samples get more."""
         bins = int(np.clip(round(second.size ** (1 / 3)), 12, 64))
         limits = [np.quantile(np.abs(values), quantile) for values in (second, third)]
         return cls(*(np.linspace(-limit, limit, bins + 1) for limit in limits))
@@ -76,7 +76,7 @@ class InvariantBins:
 
 
 class ConditionalVelocity:
-    """Conditional mean of (dQ/dt, dR/dt) of Lagrangian particles given (Q, R), from sums over bins.
+    """Conditional mean of (dQ/dt, dR/dt) of Lagrangian particles given (Q, R), from sums in bins.
 
     Rates are in units of <Q_w>^(3/2) and <Q_w>^2. Particles outside the bins are left out.
     """

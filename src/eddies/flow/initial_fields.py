@@ -10,7 +10,8 @@ def random_velocity(grid: SpectralGrid, seed: int, amplitude: float, peak_wavenu
     """Return a Gaussian solenoidal velocity (3, kz, ky, kx) with the spectrum E(k) ~ k^4 exp(-2 (k / k_p)^2).
 
     `amplitude` is the rms of one component. Random numbers are keyed by (seed, ky, kz) and drawn along kx, so the field
-    depends neither on the number of ranks nor on the resolution. Every shell has exactly its energy.
+    depends neither on the number of ranks nor on the resolution. Every shell has
+    exactly the energy of this spectrum.
     """
     velocity, energy = _gaussian_solenoidal(grid, seed)
     k = np.arange(len(energy))
@@ -19,9 +20,9 @@ def random_velocity(grid: SpectralGrid, seed: int, amplitude: float, peak_wavenu
 
 
 def velocity_of_spectrum(grid: SpectralGrid, seed: int, wavenumber: np.ndarray, energy: np.ndarray) -> np.ndarray:
-    """Return a Gaussian solenoidal velocity (3, kz, ky, kx) with a spectrum given at ascending wavenumbers.
+    """Return a Gaussian solenoidal velocity (3, kz, ky, kx) with the spectrum `energy` at ascending wavenumbers.
 
-    E(k) is interpolated in logarithms between them and zero beyond them. Random numbers are those of `random_velocity`.
+    ln E is linear in ln k between them, and E is zero beyond them. Random numbers are those of `random_velocity`.
     """
     velocity, present = _gaussian_solenoidal(grid, seed)
     given = energy > 0
@@ -87,7 +88,7 @@ def sound_wave_density(grid: SpectralGrid, amplitude: float, wavenumber: int) ->
 
 
 def balanced_density(grid: SpectralGrid, velocity: np.ndarray, sound_speed: float) -> np.ndarray:
-    """Return s = p / c^2 (kz, ky, kx) with the incompressible pressure p, with which a flow emits almost no sound."""
+    """Return s = p / c^2 (kz, ky, kx), p the incompressible pressure. A flow that starts so emits almost no sound."""
     return grid.pressure_of(grid.squares(velocity)) / sound_speed**2
 
 

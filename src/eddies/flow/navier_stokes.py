@@ -114,7 +114,7 @@ class CompressibleFluid(Fluid):
         return result
 
     def linear_function(self, function: ScalarFunction, step: float) -> np.ndarray:
-        """Return f(step L) as five real factors of each mode, (kz >= 0, ky, 5, kx), in the order of the formulas:
+        """Return f(step L): five real factors of each mode with kz >= 0, of shape (kz, ky, 5, kx), in this order:
 
             u' = transverse u + k (excess k.u + elastic sigma),   sigma' = identity sigma - coupling k.u,   sigma = -i s
 

@@ -137,7 +137,8 @@ class StabilityWatch:
     def __call__(self, before: np.ndarray, after: np.ndarray, step: float, clock: Clock) -> None:
         """Raise FlowDiverged if the step from `before` to `after`, which ends now, was unstable.
 
-        The available energy is the smallest so far plus the injected energy since then.
+        It was unstable if the energy exceeds GROWTH times the available energy, which is the smallest energy so far
+        plus the energy injected since then.
         """
         if self._ceiling == math.inf:
             self._ceiling = quadratic_energy(self.fluid, before)

@@ -79,11 +79,11 @@ class DynamicStress(StressModel):
 
         l^2 = max(<(L - H):M> / <M:M>, 0),   L = (uu)^ - u^ u^,   M = 2 ((|S|S)^ - r |S^|S^).
 
-    ^ is a test filter. r is the squared width of both filters combined over that of the first filter. H is the gradient
-    part of both filters combined minus the test-filtered gradient part of the first filter. Without a filter width the
-    first filter is the grid, and ^ cuts off above half its highest wavenumber. All tensors then have only the modes
-    below this cutoff. With a width d the first filter is Gaussian of width d, ^ is Gaussian of width 2 d, and
-    r = 5.
+    ^ is a test filter. It and the first filter form the combined filter. r is the squared width of the combined filter
+    divided by that of the first filter. H is the gradient part of the combined filter minus the test-filtered
+    gradient part of the first filter. Without a filter width the first filter is the grid, and ^ cuts off above half
+    the highest wavenumber of the grid. All tensors then have only the modes below this cutoff. With a width d the first
+    filter is Gaussian of width d, ^ is Gaussian of width 2 d, and r = 5.
     """
 
     def __init__(self, grid: SpectralGrid, filter_width: float, with_gradient: bool = False) -> None:
@@ -143,7 +143,8 @@ class SpectralViscosity(ModeDamping):
 class EddyDamping(ModeDamping):
     """Force -D(k) u with the learned damping D of the particle model.
 
-    D = k_c u_c times `rates`, given at wavenumbers equally spaced up to k_c and linear between them, with D(0) = 0.
+    D is k_c u_c times a function of k with the values `rates` at wavenumbers equally spaced up to k_c. The function is
+    linear between these wavenumbers, and D(0) = 0.
     k_c is the highest wavenumber of the grid, u_c the rms of a component of the modes above k_c/2.
     """
 

@@ -39,7 +39,9 @@ log = logging.getLogger("eddies")
 KEPT = 3
 NAME = re.compile(r"step-(\d{8,})(\.h5)?")
 PLAIN = "plain"  # the dataset of everything that is not an array, as JSON
-FORMAT = 11  # of the layout; others are not used. Raise it also with FORMAT of io/provenance.py: frames are products.
+# Checkpoints of another format are not used. Raise this number also when FORMAT of io/provenance.py is raised, because
+# frames are products.
+FORMAT = 11
 
 
 @dataclass(frozen=True)
@@ -54,13 +56,13 @@ class Block:
 
 @dataclass(frozen=True)
 class Checkpoint(Mapping):
-    """An undamaged checkpoint, which maps names to the state that `CheckpointDirectory.write` was given."""
+    """An undamaged checkpoint, which maps names to the arrays and values that `CheckpointDirectory.write` stored."""
 
     path: Path
 
     @cached_property
     def content(self) -> dict[str, Any]:
-        """Step, format, fingerprint, kernels and threads, checksums of other `files` by name, and plain `values`."""
+        """`step`, `format`, `fingerprint`, `computed_by`, plain `values`, and checksums of `files` by name."""
         return json.loads(self.read(PLAIN).tobytes())
 
     @property
@@ -94,9 +96,9 @@ class CheckpointDirectory:
     def write(self, step: int, state: Mapping[str, Any], files: Sequence[str] = ()) -> None:
         """Add a checkpoint, and remove all but the newest KEPT. If it cannot be written, earlier ones stay intact.
 
-        `state` holds `Block`s of arrays, other arrays, and values for JSON. Arrays and values are taken from rank 0,
-        because the ranks may have measured different times. `files` are names of closed files of the directory, which
-        belong to the checkpoint.
+        `state` holds `Block`s of arrays, other arrays, and values for JSON. Other arrays and values are taken from
+        rank 0, because the ranks may have measured different times. `files` are names of closed files of the directory
+        that belong to the checkpoint.
         """
         path = self.path / f"step-{step:08d}.h5"
         arrays = {name: part for name, part in state.items() if isinstance(part, np.ndarray | Block)}
@@ -125,7 +127,7 @@ class CheckpointDirectory:
         """The newest undamaged checkpoint with these settings, or None. It, its files and older checkpoints are kept;
         everything else in the directory is removed. A warning says why a newer checkpoint is not used.
 
-        Raises ProductError, and removes nothing, if the system refuses to read a file: it may be undamaged.
+        Raises ProductError, and removes nothing, if the system refuses to read a file, which may be undamaged.
         """
         paths = in_files(self.comm, self.path, lambda: _newest_first(self.path))
         while paths and (complaint := self._complaint(paths[0])):
@@ -176,9 +178,9 @@ class Guard:
         self.stop, self.of = stop or StopRequest(comm), of
 
     def __call__(self, run: Any, segments: FrameSegments | None = None) -> None:
-        """Call it before each step of a `run` with `steps` and `state_dict()`, whose frames go to `segments`.
+        """Call it before each step. `run` has `steps` and `state_dict()`; its frames go to `segments`.
 
-        If the run has to stop, it raises Stopped after the checkpoint is complete.
+        If the run has to stop, the call raises Stopped after the checkpoint is complete.
         """
         stopping = self.stop()
         if self.stop.checkpoint_due:

@@ -134,8 +134,8 @@ def find_damage(comm: MPI.Comm, path: Path, known: int | None = None) -> str | N
     """Compare a file with its checksums; collective.
 
     Returns a line with file, dataset and frame of the first damage, or None. `known` is the result of `table_checksum`
-    for the expected file. Raises ProductError, on all ranks, if the system refuses to read the file: it may be
-    undamaged.
+    for the expected file. Raises ProductError, on all ranks, if the system refuses to read the file, which may
+    be undamaged.
     """
     from eddies.parallel.broadcast import on_all_ranks, on_first_rank
     from eddies.parallel.reduction import global_min

@@ -25,7 +25,7 @@ class WriteError(ProductError):
 
 
 def write_error(path: Path | str, error: OSError, wanted: int = 0) -> WriteError:
-    """The error for a file that cannot be written, read or removed. If the disk is full, it names the bytes wanted."""
+    """The error for a file that cannot be written, read or removed. On a full disk, its text has the bytes wanted."""
     reason = error.strerror or error
     if error.errno in NO_ROOM:
         return WriteError(f"{path}: cannot be written: {reason}: {space_in_words(path, wanted)}; make room, then run "

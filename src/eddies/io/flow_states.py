@@ -1,4 +1,4 @@
-"""Initial states of a whole flow: of a ground truth, or velocities on a periodic cube from other codes.
+"""Initial states of a whole flow, from a ground truth or from velocities of other codes on a periodic cube.
 
 Supported layouts of other codes, with arrays [z, y, x] whose first point is the corner of the cube:
 
@@ -86,13 +86,13 @@ class VelocityCubes:
         return np.concatenate([_read_planes(dataset, start, stop) for dataset in self._states[index]])
 
     def check(self, comm: MPI.Comm, index: int, velocity: np.ndarray) -> None:
-        """Raise ProductError if the velocity cannot be that of a flow; `velocity`: planes of this rank; collective."""
+        """Raise ProductError if `velocity`, the planes of this rank, cannot be that of a flow; collective."""
         dataset = self._states[index][0]
         own = [np.ravel(dataset.attrs[name]) for name in FILL_ATTRIBUTES if name in dataset.attrs]
         fills = dict.fromkeys([*NOT_DELIVERED, *(float(value[0]) for value in own
                                                  if value.size and value.dtype.kind == "f" and value[0])])
         for fill in fills:  # in the same order on all ranks
-            with np.errstate(over="ignore"):  # in half precision
+            with np.errstate(over="ignore"):  # a mark may exceed half precision
                 mark = np.asarray(fill).astype(velocity.dtype)
             if count := int(global_sum(comm, np.count_nonzero(velocity == mark))):
                 raise ProductError(f"{_place(dataset)}: {count} values are {fill:.6g}, the mark of points that were "
@@ -235,7 +235,7 @@ def read_spectrum(path: Path) -> tuple[np.ndarray, np.ndarray]:
     One rank calls it. Raises ProductError if the file holds something else.
     """
     try:
-        with warnings.catch_warnings(action="ignore"):  # of an empty file
+        with warnings.catch_warnings(action="ignore"):  # numpy warns of an empty file
             table = np.loadtxt(path, ndmin=2, encoding="utf-8")
     except OSError as error:
         raise read_error(path, error) or ProductError(f"{path}: cannot be read") from None

@@ -22,7 +22,7 @@ class FieldLayout:
     """The content of a series of fields."""
 
     cells: int  # grid points along each side
-    variables: Mapping[str, int]  # number of components
+    variables: Mapping[str, int]  # number of components of each variable
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class TrajectoryLayout:
     """The content of the frames of particles."""
 
     total: int  # number of particles
-    columns: Mapping[str, tuple[int, ...]]  # shape of one particle's value
+    columns: Mapping[str, tuple[int, ...]]  # shape of one particle's value in each column
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ class FrameLayout:
 
     def writers(self, file: File, names: Mapping[str, str], images: bool = False
                 ) -> tuple[dict[str, TrajectoryWriter], dict[str, FieldWriter]]:
-        """Writers of the trajectories and fields that `names` maps to their names in the file; collective. `images`
-        adds the column of images to trajectories with positions."""
+        """Writers of the trajectories and of the fields in `names`; collective. `names` maps them to their names in the
+        file. `images` adds the column `image` to trajectories with positions."""
         return ({name: TrajectoryWriter(file, names[name], series.total, self.length, series.columns, self.dtype,
                                         images and "position" in series.columns)
                  for name, series in self.trajectories.items() if name in names},
@@ -54,13 +54,13 @@ class FrameLayout:
 
     @property
     def names(self) -> dict[str, str]:
-        """All series, each under its own name."""
+        """All series, each mapped to its own name."""
         return {name: name for name in (*self.trajectories, *self.fields)}
 
 
 class FrameSegments:
-    """The files frames-NNNNNNNN.h5 of a directory, named after their first step; `names` lists the closed ones. The
-    first of them may be a product with the same series.
+    """The files frames-NNNNNNNN.h5 of a directory, named after their first step; `names` lists the closed files.
+    The first closed file may be a product with the same series.
 
     If the context ends with an exception, the open segment is removed. `assemble` copies frames into a product.
     """
@@ -86,7 +86,7 @@ class FrameSegments:
             self._name = ""
 
     def first_frames(self, name: str, count: int) -> list[tuple[float, dict[str, np.ndarray]]]:
-        """Time and this rank's block of the first `count` frames of a trajectory that every closed segment holds."""
+        """Time and columns of the first `count` frames of a trajectory of the closed segments, in this rank's block."""
         frames: list[tuple[float, dict[str, np.ndarray]]] = []
         for segment in self.names[:count]:  # each holds one frame or more
             with open_product(self.comm, self.directory / segment, None) as file:
@@ -95,8 +95,8 @@ class FrameSegments:
         return frames[:count]
 
     def assemble(self, file: File, names: Mapping[str, str] | None = None) -> None:
-        """Copy the frames of all segments into a product, and add the images. `names` maps the series to copy to their
-        names in the product; None: all series under their own names."""
+        """Copy the frames of all segments into a product, and add the images. `names` maps each series to copy to its
+        name in the product. If it is None, all series are copied under their own names."""
         self.close()
         trajectories, fields = self.layout.writers(file, self.layout.names if names is None else names, images=True)
         slabs = {name: SlabDecomposition(self.comm, self.layout.length, series.cells)

@@ -44,8 +44,8 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
     """Write a product, all ranks together. It appears under `path` after the block has ended without an exception.
 
     `provenance` (the scene's text, its fingerprint, ...; JSON-able) is stored with the versions of all libraries, the
-    number of ranks, the date and an id. Its `made_from` names kinds of products; the ids of those in the same directory
-    are stored. An `id` in it is kept: the file then replaces one that other products were made from.
+    number of ranks, the date and an id. Its `made_from` lists kinds of products; the ids of such products in the same
+    directory are stored. An `id` in `provenance` is kept: the file then replaces one from which others were made.
 
     Raises:
         WriteError: on all ranks; the file cannot be written or renamed.
@@ -65,7 +65,7 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
 
 @contextmanager
 def open_product(comm: MPI.Comm, path: str | Path, kind: str | None) -> Iterator[h5py.File]:
-    """Read a complete product of a kind (None: any kind). All ranks call it; if one cannot open it, all raise.
+    """Read a complete product of a kind, or of any kind if it is None. If one rank cannot open it, all ranks raise.
 
     Raises:
         ProductError: the file is missing, truncated, not an HDF5 file, unfinished, or of another kind or format.
@@ -106,7 +106,7 @@ def read_table(file: h5py.Group, name: str) -> dict[str, np.ndarray]:
 
 
 def find_group(file: h5py.Group, name: str) -> h5py.Group:
-    """The group `name`; ProductError, which lists the others, if there is no such group."""
+    """The group `name`. If there is no such group, ProductError, which lists what there is."""
     group = file.get(name)
     if not isinstance(group, h5py.Group):
         raise ProductError(f"{file.file.filename}: holds no {name}; {file.name} holds: {', '.join(file) or 'nothing'}")
@@ -114,7 +114,9 @@ def find_group(file: h5py.Group, name: str) -> h5py.Group:
 
 
 def stored_numbers(file: h5py.File) -> Iterator[tuple[str, int | None, np.ndarray]]:
-    """Place, frame and values of all floating-point numbers of an open product; of a series, only the last frame."""
+    """Place, frame and values of the floating-point numbers of an open product: the last frame of each series, and all
+    other numbers, whose frame is None.
+    """
     names: list[str] = []
     file.visit(names.append)
     for name in names:
@@ -132,7 +134,7 @@ def stored_numbers(file: h5py.File) -> Iterator[tuple[str, int | None, np.ndarra
 def growing_dataset(group: h5py.Group, name: str, frame_shape: tuple[int, ...], dtype: Any) -> h5py.Dataset:
     """Create an empty dataset (frames, *frame_shape) for `append_frame`; collective.
 
-    A chunk has about 1 MiB at most: a part of a frame, or many frames of a few values.
+    A chunk has at most about 1 MiB. It holds part of a frame, or many frames if a frame has few values.
     """
     values = math.prod(frame_shape)
     chunk, largest = [256 // values if 0 < values <= FEW else 1], CHUNK_BYTES // np.dtype(dtype).itemsize
@@ -171,8 +173,8 @@ def write_block(dataset: h5py.Dataset, block: np.ndarray, offset: tuple[int, ...
 def read_frame(dataset: h5py.Dataset, frame: int, selection: tuple[slice, ...], limit: float = np.inf) -> np.ndarray:
     """A part of a frame of floating-point numbers.
 
-    ProductError, on this rank, if a number is outside the range 0 to a given `limit`, or is not finite. Only a rollout
-    may end with numbers that are not finite.
+    ProductError, on this rank, if a number is outside the range 0 to `limit`, where a limit is given, or is not finite.
+    In a rollout, which may end with numbers that are not finite, they are no error.
     """
     values, kind = dataset[frame, *selection], dataset.file.attrs["kind"]
     place = f"frame {frame % len(dataset)}: holds values that are"

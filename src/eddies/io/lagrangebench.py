@@ -21,7 +21,7 @@ from eddies.io.new_files import create_export, write_files
 from eddies.io.trajectories import Trajectory
 
 SPLITS = ("train", "valid", "test")
-FRAMES_OF_A_SPLIT = 3  # at least: an acceleration needs three frames
+FRAMES_OF_A_SPLIT = 3  # smallest number, because an acceleration needs three frames
 FLUID = 0  # the type of all particles
 CONNECTIVITY = 1.45  # radius of pairs in the data sets of LagrangeBench, in mean distances between particles
 SMALLEST_DEVIATION = 1e-7  # a smaller standard deviation is stored as 1: the reader divides by it
@@ -47,8 +47,8 @@ def shortcoming(trajectory: Trajectory) -> str | None:
 
 
 def write_dataset(directory: Path, trajectory: Trajectory, case: str, provenance: Mapping[str, Any]) -> None:
-    """Write three consecutive parts of a trajectory without `shortcoming` as a data set; on one rank. Its metadata name
-    it `case`. ProductError if a file cannot be written; existing files are then unchanged.
+    """Write three consecutive parts of a trajectory as a data set with the name `case`; on one rank. `shortcoming` of
+    the trajectory must be None. ProductError if a file cannot be written; existing files are then unchanged.
     """
     total, start, moments = trajectory.total, 0, []
     lengths = split_frames(len(trajectory.times))
@@ -65,7 +65,7 @@ def write_dataset(directory: Path, trajectory: Trajectory, case: str, provenance
 
 
 def _copy_frames(trajectory: Trajectory, start: int, positions: h5py.Dataset) -> np.ndarray:
-    """Copy frames from `start` on. Returns mean and mean square of velocity and acceleration, (2, 2, 3)."""
+    """Copy frames from `start` on. Returns for velocity and acceleration the mean and mean square, (2, 2, 3)."""
     length, sums, before, velocity_before = trajectory.length, np.zeros((2, 2, 3)), None, None
     for row in range(len(positions)):
         stored = trajectory.read(start + row, "position").astype(np.float32)

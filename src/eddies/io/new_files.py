@@ -14,8 +14,8 @@ Two measures prevent this, and a third is for an h5py that is built without MPI,
    writes at the end.
 2. If a write fails nevertheless, or one of several ranks raises an exception that the others may not know of, the file
    is left open, as NAME.partial, and the job is aborted.
-3. Without MPI in h5py, rank 0 writes for all: `own_part` sends it the blocks of the other ranks. These have a file in
-   memory with the same groups, attributes and shapes, so callers see no difference.
+3. Without MPI in h5py, rank 0 writes for all: `own_part` sends it the blocks of the other ranks. The other ranks have
+   a file in memory with the same groups, attributes and shapes, so callers see no difference.
 
 A job may lose its run directory to another one (io/run_lock.py), which then writes a NAME.partial of its own. So a file
 is renamed or removed only if it still is the file that this job created.
@@ -46,7 +46,7 @@ from eddies.parallel.stop import Stopped
 
 # Upper limits of what HDF5 writes beside the values: for a dataset, for a chunk, and when it closes a file.
 HEADER_BYTES, INDEX_BYTES, MARGIN_BYTES = 2**14, 2**8, 2**19
-# Largest product if rank 0 writes for all: it holds one frame in memory, and the others wait.
+# Largest product if rank 0 writes for all. Rank 0 then holds one frame in memory, and the other ranks wait.
 LARGEST_BYTES = 4 * 10**9
 REMEDY = ("run on one rank, or build h5py with MPI: `CC=mpicc HDF5_MPI=ON pip install --no-binary=h5py "
           "--no-build-isolation h5py`")
@@ -62,7 +62,7 @@ _abandoned: list[_NewFile] = []
 def write_files(contents: Mapping[Path, bytes | str]) -> None:
     """Write small files on one rank. They get their names after all of them have been written.
 
-    Raises WriteError if a file cannot be written or renamed. Existing files are unchanged if one cannot be written.
+    Raises WriteError if a file cannot be written or renamed. If one cannot be written, no existing file is changed.
     """
     partials = {path: path.with_name(path.name + ".partial") for path in contents}
     whole = {path: content.encode() if isinstance(content, str) else content for path, content in contents.items()}
@@ -112,7 +112,7 @@ def new_file(comm: MPI.Comm, path: Path, checksums: bool = True) -> Iterator[h5p
 
 @contextmanager
 def create_export(path: Path, layout: Layout, provenance: Mapping[str, Any], overhead: int = 0) -> Iterator[h5py.File]:
-    """Write an HDF5 file for other programs, on one rank. It has empty datasets and the provenance of a product.
+    """Write an HDF5 file for other programs, on one rank. It has the empty datasets of `layout` and a provenance.
 
     All space is reserved at the beginning: for the datasets, and `overhead` bytes for the rest. The directory is made
     if it is missing. Raises WriteError.
@@ -130,7 +130,7 @@ def create_export(path: Path, layout: Layout, provenance: Mapping[str, Any], ove
 
 @contextmanager
 def writing(group: h5py.Group | h5py.Dataset, size: int) -> Iterator[None]:
-    """Write at most `size` bytes to a new file inside the block; the same size on all ranks.
+    """Inside the block the caller writes at most `size` bytes to a new file. `size` is the same on all ranks.
 
     Raises:
         WriteError: on all ranks; the disk is full.
@@ -158,8 +158,10 @@ def has_single_writer(comm: MPI.Comm) -> bool:
 
 def own_part(group: h5py.Group | h5py.Dataset, shape: tuple[int, ...], block: np.ndarray,
              offset: tuple[int, ...]) -> tuple[np.ndarray, tuple[int, ...]]:
-    """The part of an array that this rank writes, and its offset: its block or, if rank 0 writes for all, the whole
-    array of this `shape` on rank 0 and an empty one on the others; collective."""
+    """The part of an array of this `shape` that this rank writes, and the offset of the part; collective.
+
+    The part is the rank's block. If rank 0 writes for all, it is the whole array on rank 0, and empty on other ranks.
+    """
     comm = _open[group.file.filename].comm
     if not has_single_writer(comm) or not shape:
         return block, offset

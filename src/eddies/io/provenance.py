@@ -83,8 +83,8 @@ def product_fingerprint(path: str | Path) -> str | None:
 
 
 def others_trained_on(origin: Mapping[str, Any]) -> list[str]:
-    """The ground truths that a model was trained on; empty if that of its own run is among them. `origin` is the
-    model's provenance."""
+    """The ground truths that a model was trained on; empty if the ground truth of its own run is among them. `origin`
+    is the model's provenance."""
     truths = origin.get("truths", {})
     return [] if origin.get("made_from", {}).get("ground_truth") in truths.values() else list(truths)
 

@@ -1,6 +1,7 @@
 """Units, axes and descriptions of the datasets of products, stored as their attributes.
 
-Units: L is the edge of the cube over 2 pi, T follows from lengths and velocities, M makes the mean density 1 M/L^3.
+Units: L is the edge of the cube divided by 2 pi. T follows from lengths and velocities. M is such that the mean density
+is 1 M/L^3.
 """
 
 from __future__ import annotations
@@ -137,7 +138,7 @@ def describe(dataset: h5py.Dataset) -> None:
 
 
 def dataset_attributes(kind: str, path: str) -> dict[str, str]:
-    """Units, axes and description of the dataset at a path in a product of a kind; empty if it is unknown."""
+    """Units, axes and description of the dataset at a path in a product of a kind; empty if the path is unknown."""
     group, _, name = path.rpartition("/")
     quantity = next((each for pattern, each in QUANTITIES.items() if fnmatchcase(path, pattern)), None)
     if quantity is None and name == "time":

@@ -42,9 +42,9 @@ class Tracks:
 
     Parameters
     ----------
-    time : (rows,). track : id of the track, (rows,).
-    position, velocity : (rows, 3). density : (rows,). Velocity and density are None if they were not measured.
-    edge : of the periodic cube; None: the file has none.
+    time, track : time and track id of each row, (rows,).
+    position, velocity, density : (rows, 3), (rows, 3) and (rows,). The last two are None if they were not measured.
+    edge : edge of the periodic cube; None if the file gives none.
     """
 
     time: np.ndarray
@@ -61,7 +61,7 @@ class Tracks:
         return {name: values for name, values in found.items() if values is not None}
 
     def chosen(self, rows: np.ndarray) -> Tracks:
-        """The tracks at some rows, given by number or mask."""
+        """The tracks with these rows only; `rows` holds numbers or a mask."""
         return replace(self, **{name: values[rows] for name, values in self.columns.items()})
 
     @cached_property
@@ -75,9 +75,9 @@ class Tracks:
         return np.append(np.searchsorted(self.time, self.times), len(self.time))
 
     def displacements(self, edge: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pairs of successive rows of a track: first rows (m,), displacements (m, 3) and intervals (m,).
+        """All m pairs of successive rows of a track: first rows (m,), displacements (m, 3) and intervals (m,).
 
-        In a periodic cube with this edge, displacements lead to the nearest image; None: no periodic cube.
+        `edge` is that of a periodic cube, in which displacements lead to the nearest image, or None without a cube.
         """
         order = np.lexsort((self.time, self.track))
         same = self.track[order[1:]] == self.track[order[:-1]]
@@ -93,9 +93,9 @@ def read_tracks(path: str | Path, layout: str | None = None, group: str | None =
 
     Parameters
     ----------
-    layout : one of LAYOUTS; None: by the name and content of the file.
-    group : name of the group of particles of an H5MD file, or of the trajectory of a LagrangeBench file, if it has
-        several.
+    layout : one of LAYOUTS; None to find it by the name and content of the file.
+    group : name of the group of particles of an H5MD file, or of the trajectory of a LagrangeBench file; needed if
+        the file has several.
     interval : time between frames, for an NPZ file without times.
 
     Raises:
@@ -125,7 +125,7 @@ def write_tracks(path: str | Path, times: Any, ids: Any, positions: Any, velocit
     ----------
     times, ids : time and number of the track of each row, (rows,). Ids are at least 0.
     positions, velocities : (rows, 3); velocities may be None.
-    edge : of the periodic cube.
+    edge : edge of the periodic cube.
 
     Raises:
         ProductError: a value is not finite, the arrays have different numbers of rows, a track appears twice at one
@@ -311,7 +311,10 @@ def checked(tracks: Tracks, path: Path) -> Tracks:
 
 
 def check_inside(tracks: Tracks, lower: np.ndarray, upper: np.ndarray, key: str, path: str | Path) -> None:
-    """Raise ProductError if positions are outside the box or volume that a key gives: the unit of length is wrong."""
+    """Raise ProductError if positions are outside the box or volume from `lower` to `upper`, the value of `key`.
+
+    The unit of length is then wrong.
+    """
     margin = ROUNDING * (upper - lower)
     outside = np.flatnonzero(((tracks.position < lower - margin) | (tracks.position > upper + margin)).any(1))
     if len(outside):

@@ -30,10 +30,10 @@ class TrajectoryWriter:
     total : number of particles over all ranks.
     length : edge of the periodic cube.
     columns : shape of one particle's value by column, such as {"position": (3,), "density": ()}.
-    dtype : of every column in the file.
+    dtype : type of every column in the file.
     images : whether to add the column `image` (3,). It counts how often a particle has left the cube along each axis
         since the first frame, so that position + edge * image is a continuous path. Particles must move by less than
-        half an edge between frames, and every `append` of a rank must have the same rows.
+        half an edge between frames, and a rank must hold the same rows in every `append`.
     """
 
     def __init__(self, file: h5py.File, name: str, total: int, length: float,
@@ -115,7 +115,8 @@ class Trajectory:
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Rows start, ..., stop - 1 of a column at a frame, (stop - start, ...), in order of id.
 
-        Raises ProductError if a number is not finite, or a position is outside the cube.
+        Raises ProductError if ids are not in order, a position is outside the cube or, except in a rollout, a number
+        is not finite.
         """
         rows, ids = slice(start, stop), self._group["id"]
         if (start, stop) not in self._in_order:

@@ -28,8 +28,8 @@ def write_images(path: Path, series: FieldSeries, length: float, corner: np.ndar
                  provenance: Mapping[str, Any]) -> None:
     """Write a series of fields in a cube of edge `length` as ImageData, a step for each frame; on one rank.
 
-    The first point is at `corner` (3,). The values are point data. The plane at L, equal to that at 0 by periodicity,
-    is added along each axis, so that the (cells + 1)^3 points span the whole cube. ProductError if the file cannot be
+    The first point is at `corner` (3,). The values are point data. The plane at `length`, equal to that at 0, is
+    added along each axis, so that the (cells + 1)^3 points span the whole cube. ProductError if the file cannot be
     written.
     """
     cells, frames, layout = series.cells, len(series.times), {}

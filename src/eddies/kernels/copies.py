@@ -1,8 +1,8 @@
 """Copies before and after the one-dimensional passes of a slab transform.
 
 Along an axis of `cells` points a transform keeps the modes 0 ... K, -K ... -1, at both ends of its arrays. The gap
-between them stays zero. Arrays that are used many times are `described` once, because numpy returns addresses slowly.
-They must be contiguous and of the given precision; ValueError otherwise.
+between them stays zero. Arrays that are used many times are passed to `described` once, because numpy returns addresses
+slowly. They must be contiguous and of the given precision; ValueError otherwise.
 """
 
 from __future__ import annotations
@@ -84,12 +84,12 @@ class ColumnCopies(_Copies):
         self._receive = self._function("receive_column", ADDRESS, *4 * [INT], ADDRESS)
 
     def fill(self, modes: _Array, component: int, rows: slice, factors: _Array | None, column: _Array) -> None:
-        """Copy modes, times factors (kz) if given, to a column."""
+        """Copy the modes of some rows, multiplied by the factors (kz) if given, to a column."""
         sizes, start = self._sizes(modes, component, rows, column)
         self._fill(*sizes, start, None if factors is None else factors.address, column.address)
 
     def store(self, column: _Array, scale: float, modes: _Array, component: int, rows: slice) -> None:
-        """Copy a column times a number to modes."""
+        """Copy a column, multiplied by `scale`, to the modes of some rows."""
         sizes, start = self._sizes(modes, component, rows, column)
         self._store(*sizes, column.address, scale, start)
 
@@ -115,10 +115,11 @@ class ColumnCopies(_Copies):
 class PlaneCopies(_Copies):
     """Copies between blocks, packed modes and planes for transforms in (y, x).
 
-    Blocks (c, planes, y, x), kx >= 0, are what ranks exchange; they follow each other in y. Two real planes f and g,
-    half a block of planes apart, are transformed as one complex plane f + i g, whose packed modes (c, pairs, ky, kx)
-    hold kx = 0 ... K, -K ... -1. The number of planes is even, or one: a single plane is its own partner. Round-off may
-    make modes of kx = 0 and their mirror images not exactly conjugate, so their mean is taken.
+    Blocks (c, planes, y, x) hold the modes with kx >= 0 that ranks exchange; they follow each other in y. Two real
+    planes f and g, half a block of planes apart, are transformed as one complex plane f + i g. Its packed modes
+    (c, pairs, ky, kx) hold kx = 0 ... K, -K ... -1. The number of planes is even, or one: a single plane is its own
+    partner. Because of round-off, modes with kx = 0 and their mirror images may not be exactly conjugate, so their mean
+    is taken.
     """
 
     exchanged_axis = 2

@@ -23,8 +23,9 @@ class _Modes(ctypes.Structure):
 class Formulas:
     """Formulas for fields (c, ...) at grid points and for modes (c, kz, ky, kx) with the given wavevectors.
 
-    Terms of a sum are pairs (factors, state), where factors (kz >= 0, ky, n, kx) are equal for kz and -kz. Arrays must
-    have the grid's precision. Modes must be contiguous, and so must each field; ValueError otherwise.
+    A term of a sum is a pair (factors, state). Factors have the shape (kz, ky, n, kx) and are stored for kz >= 0 only,
+    because they are equal for kz and -kz. Arrays must have the grid's precision. Modes must be
+    contiguous, and so must each field; ValueError otherwise.
     """
 
     def __init__(self, library: ctypes.CDLL, wavevector: Sequence[np.ndarray]) -> None:
@@ -64,7 +65,7 @@ class Formulas:
         return self._sum(self._decays, [components], components, 1, terms)
 
     def sum_of_acoustic_blocks(self, terms: Terms) -> np.ndarray:
-        """Sum of states (4, kz, ky, kx), each multiplied by the `AcousticBlock` of its factors (n = 5)."""
+        """Sum of states (4, kz, ky, kx), each mapped with its factors (n = 5) by `add_acoustic_block` in flow.cpp."""
         return self._sum(self._acoustic_blocks, [], 4, 5, terms)
 
     def _sum(self, function: Callable[..., None], counts: list[int], components: int, factors: int,

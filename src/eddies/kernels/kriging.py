@@ -9,7 +9,8 @@ import numpy as np
 
 from eddies.kernels.library import ADDRESS, INT, NUMBER, address, members, require
 
-# Most neighbours of a receiver. The equations of a vector of such receivers take 64 MB in single precision.
+# Largest number of neighbours of a receiver. With so many neighbours, the equations of the receivers that are solved
+# together, up to 16, take 64 MB in single precision.
 MOST_NEIGHBORS = 1024
 
 
@@ -28,12 +29,12 @@ def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.
                     sited: bool = True) -> tuple[np.ndarray, list[np.ndarray]]:
     """Weights of the receivers' own values (10, n), and of their neighbours' values, ten arrays (m,).
 
-    `eddies.particles.kriging.kriging_weights` defines them. The ten arrays are separate so that freed ones are small
-    enough to be kept by the allocator.
+    `eddies.particles.kriging.kriging_weights` defines them. The ten arrays are separate so that each is small enough
+    for the allocator to keep its memory when it is freed.
 
     Parameters
     ----------
-    offsets : int64 (n + 1,), each receiver's pairs.
+    offsets : int64 (n + 1,), first pair of each receiver and, at the end, the number of pairs.
     displacement : (3, m), x_i - x_j, contiguous, in single or double precision.
     support : distance beyond which a receiver has no neighbours.
     noise : variance of the part of a value that does not belong to the field.
@@ -55,9 +56,9 @@ def weighted_sums(library: ctypes.CDLL, offsets: np.ndarray, senders: np.ndarray
                   weights: Sequence[np.ndarray], field: np.ndarray) -> np.ndarray:
     """own_i f_i + sum_j weights_ij f_j, (n, c, rows), for one, three, four or ten rows of weights.
 
-    `offsets` (n + 1,) and `senders` (m,), int64, are each receiver's pairs and their senders. `own` has rows (n,), or
-    is None if receivers are not particles; `weights` has rows (m,). `field` (s, c) begins with the receivers if these
-    are particles. Raises ValueError for arrays of another shape, type or layout.
+    `offsets` (n + 1,) is as in `kriging_weights`, and `senders` (m,) has the sender of each pair; both are int64. `own`
+    has rows (n,), or is None if receivers are not particles; `weights` has rows (m,). `field` (s, c) begins
+    with the receivers if these are particles. Raises ValueError for arrays of another shape, type or layout.
     """
     receivers, rows, dtype, sited = len(offsets) - 1, len(weights), field.dtype, own is not None
     own = own if sited else []

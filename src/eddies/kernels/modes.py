@@ -21,8 +21,10 @@ class ModePasses:
 
     Parameters
     ----------
-    wavevector : kx, ky, kz, broadcast over (kz, ky, kx); `multiplicity` likewise, of kx alone.
-    inverse_squared, scale, penalty : (kz, ky, kx); `scale` sets the precision of all arrays.
+    wavevector : kx, ky and kz, each of a shape that broadcasts to (kz, ky, kx).
+    multiplicity : number of times that a stored mode is counted; it depends on kx alone.
+    inverse_squared, scale, penalty : (kz, ky, kx), 1/k^2 and the factors in `apply`. All arrays have the precision of
+        `scale`.
     """
 
     def __init__(self, library: ctypes.CDLL, wavevector: Sequence[np.ndarray], multiplicity: np.ndarray,
@@ -37,13 +39,13 @@ class ModePasses:
         self._weights = _Weights(z, y, x, *map(address, self._arrays))
 
     def apply(self, given: np.ndarray, modes: np.ndarray) -> tuple[np.ndarray, float]:
-        """I = P (scale given) + penalty modes, where P projects on solenoidal modes, and <I, modes>."""
+        """I = P (scale * given) + penalty * modes, where P projects on solenoidal modes; and <I, modes>."""
         applied = np.empty_like(modes)
         return applied, self._call("modes_image", ctypes.c_double, [], [given, modes, applied])
 
     def descend(self, length: float, inverse: np.ndarray, direction: np.ndarray, applied: np.ndarray,
                 solution: np.ndarray, residual: np.ndarray) -> float:
-        """solution += length direction, residual -= length applied; returns <residual, inverse * residual>."""
+        """solution += length * direction, residual -= length * applied; returns <residual, inverse * residual>."""
         return self._call("modes_descend", ctypes.c_double, [length, inverse], [direction, applied, solution, residual])
 
     def update_direction(self, beta: float, inverse: np.ndarray, residual: np.ndarray, direction: np.ndarray) -> None:
@@ -51,7 +53,7 @@ class ModePasses:
         self._call("modes_turn", None, [beta, inverse], [residual, direction])
 
     def _call(self, name: str, result: type | None, given: list, vectors: list[np.ndarray]) -> float:
-        """Call a function with `given`, a number and an array (kz, ky, kx) or neither, and with vectors."""
+        """Call a function with vectors, and with `given`: empty, or a number and an array (kz, ky, kx)."""
         for array in given[1:]:
             require(array, self._shape, self._kind)
         for vector in vectors:

@@ -32,9 +32,10 @@ class _Listed(ctypes.Structure):
 
 def neighbors_within(library: ctypes.CDLL, box: Box, radius: float, receivers: np.ndarray, senders: np.ndarray,
                      exclude_self: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The senders (s, 3) within a radius of each receiver (n, 3), in compressed rows: offsets (n + 1,), senders (m,).
+    """The senders (s, 3) within a radius of each receiver (n, 3): offsets (n + 1,), and row numbers of senders (m,).
 
-    With `exclude_self` receiver i is sender i, and not its own neighbour. All positions must be finite.
+    Receiver i has the row numbers from place offsets[i] to offsets[i + 1] - 1. With `exclude_self` receiver i is sender
+    i, and is not its own neighbour. All positions must be finite.
     """
     receivers, senders = (np.ascontiguousarray(points, np.float64) for points in (receivers, senders))
     offsets = np.empty(len(receivers) + 1, np.int64)
@@ -49,7 +50,7 @@ def neighbors_within(library: ctypes.CDLL, box: Box, radius: float, receivers: n
 
 def pairs_within(library: ctypes.CDLL, box: Box, radius: float, receivers: np.ndarray, senders: np.ndarray,
                  offsets: np.ndarray, listed: np.ndarray, rows: np.ndarray, kind: np.dtype) -> tuple[np.ndarray, ...]:
-    """The pairs of a list that are within a radius now, for the receivers `rows` (k,).
+    """The pairs of a list (`offsets`, `listed`) that are within a radius now, for the receivers `rows` (k,).
 
     Returns for each pair the receiver, its place in `rows` and the sender (m,), the displacement to the nearest image
     (3, m), and the distance (m,).

@@ -17,10 +17,10 @@ DONE, UNKNOWN, NO_GRADIENT = -1, -2, -3
 
 @dataclass(frozen=True)
 class Summand:
-    """A quantity to sum over pairs, by its name `kind` and its constants `numbers` in summands.hpp.
+    """A quantity to sum over pairs: its name `kind` and its constants `numbers`, as in summands.hpp.
 
-    The second particle of a mutual pair gets the first one's value times `parity` (components,). `scalar` is the first
-    column of scalars that it reads.
+    The second particle of a mutual pair gets the first one's value times `parity` (components,). `scalar` is the
+    number of the first scalar column that the summand reads.
     """
 
     kind: str
@@ -65,9 +65,10 @@ class _Given(ctypes.Structure):
 
 
 class CompiledPairs:
-    """Particles, and sums over their pairs for the `wanted` ones, bool (n,), in the precision `kind`.
+    """Particles, and sums over pairs for each particle that is `wanted`, bool (n,), in the precision `kind`.
 
-    `position` and `velocity` are (n, 3), `scalars` (k, n) at most MOST_SCALARS columns in the units of the summands.
+    `position` and `velocity` have the shape (n, 3). `scalars` (k, n) are at most MOST_SCALARS columns, in the units of
+    the summands. Raises ValueError for other shapes.
     """
 
     def __init__(self, library: ctypes.CDLL, space: PairSpace, position: np.ndarray, velocity: np.ndarray,
@@ -95,10 +96,10 @@ class CompiledPairs:
 
     def gradients(self, summands: Sequence[Summand], parameters: Sequence[np.ndarray], by_sums: Sequence[np.ndarray],
                   columns: bool) -> tuple[list[np.ndarray], tuple[np.ndarray, ...]]:
-        """Gradients by parameters and, if `columns`, by position, velocity and scalars.
+        """Gradients with respect to parameters and, if `columns`, to position, velocity and scalars.
 
-        `by_sums` are gradients by the sums, zero at particles that are not wanted. Raises ValueError as `sums` does,
-        and if a summand has no gradient.
+        `by_sums` are gradients with respect to the sums; they are zero at particles that are not wanted. Raises
+        ValueError as `sums` does, and if a summand has no gradient.
         """
         by_parameters = [np.zeros(len(values)) for values in parameters]
         by_columns = tuple(np.empty_like(column) for column in self._columns[:3]) if columns else ()

@@ -15,7 +15,7 @@ FITS = {1: "fit_linear", 2: "fit_quadratic"}
 
 @dataclass(frozen=True)
 class GridPlanes:
-    """Planes `first`, ..., `first + planes - 1` of a grid with `cells`^2 points each, `spacing` apart."""
+    """Planes `first`, ..., `first + planes - 1` of a grid: `cells`^2 points a plane, `spacing` from point to point."""
 
     cells: int
     spacing: float
@@ -39,8 +39,8 @@ def kernel_numbers(support: float, pieces: np.ndarray, signed: bool = False) -> 
 
     Parameters
     ----------
-    pieces : W in equally long pieces of the support, (pieces, coefficients): the coefficients of u^0, u^1, ..., where u
-        falls from 1 to 0 along a piece.
+    pieces : polynomial coefficients of W(r) on equal intervals of 0 <= r < support, (intervals, coefficients). They
+        belong to u^0, u^1, ..., where u falls from 1 to 0 along an interval.
     signed : whether W may be negative.
     """
     return support, -np.inf if signed else 0.0, *map(float, pieces.shape), *map(float, pieces.ravel())
@@ -65,11 +65,11 @@ def sums_on_grid(library: ctypes.CDLL, grid: GridPlanes, numbers: tuple[float, .
 def fitted(library: ctypes.CDLL, box: Box, degree: int, numbers: tuple[float, ...], volume: float, ridge: float,
            offsets: np.ndarray, senders: np.ndarray, receivers: np.ndarray, positions: np.ndarray,
            values: np.ndarray) -> np.ndarray:
-    """Moving least squares: values and their derivatives along x, y and z, (n, 4, 3), of the fitted polynomials.
+    """Moving least squares: value and derivatives along x, y and z of three fitted components, (n, 4, 3).
 
     `eddies.particles.particle_field.ParticleField.fitted` defines them. `numbers` are the weight W as `kernel_numbers`
-    returns it, `volume` the mean volume of a particle. `offsets` (n + 1,) and `senders` (m,) are the particles listed
-    near each receiver; some may be too far. `positions` and `values` are (s, 3), `receivers` (n, 3).
+    returns it, `volume` the mean volume of a particle. `offsets` (n + 1,) and `senders` (m,) list the particles near
+    each receiver; some may lie outside the support. `positions` and `values` are (s, 3), `receivers` (n, 3).
     """
     kernel = np.array(numbers)
     offsets, senders = (np.ascontiguousarray(rows, np.int64) for rows in (offsets, senders))

@@ -16,7 +16,7 @@ PADDING = 8
 
 @dataclass(frozen=True)
 class PaddedPlanes:
-    """The `planes` planes from number `lowest` on that a rank holds of a periodic grid of `cells`^3 points.
+    """The planes that a rank holds of a periodic grid of `cells`^3 points: `planes` of them, from number `lowest` on.
 
     They come in parts (components, planes, y, x) that follow each other: ghosts, own planes, ghosts.
     """
@@ -60,7 +60,7 @@ class Splines:
             raise MisplacedPoint(misplaced)
 
     def at(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """Values (n, c) of planes, summed in their precision."""
+        """Values (n, c) at the points, from planes of coefficients and in the precision of the planes."""
         values = np.empty((self._cloud.points, len(parts[0])))
         self._call("splines_at", _contiguous(parts), values)
         return values
@@ -72,7 +72,7 @@ class Splines:
         return gradients / self._padded.spacing
 
     def spread(self, values: np.ndarray, parts: Sequence[np.ndarray]) -> None:
-        """Add the transpose of `at`, applied to values (n, c), to planes, contiguous and in one precision."""
+        """Add to planes the transpose of `at`, applied to values (n, c). Planes are contiguous and of one precision."""
         self._call("splines_spread", parts, np.ascontiguousarray(values, np.float64))
 
     def _call(self, name: str, parts: Sequence[np.ndarray], *columns: np.ndarray) -> None:

@@ -49,12 +49,12 @@ class KernelNeighborhood:
 
 @dataclass(frozen=True)
 class FieldLater:
-    """Particles and filtered flow one frame after a frame of the training.
+    """Particles and filtered flow one frame after the frame that is trained on, the training frame.
 
     Parameters
     ----------
-    position, velocity : (n, 3), rows as in the particles of that frame; positions are not wrapped into the box.
-    span : time from the frame before that frame to the frame after it.
+    position, velocity : (n, 3), rows as in the training frame; positions are not wrapped into the box.
+    span : time from the frame before the training frame to the frame after it.
     points, field : this rank's grid points (m, 3), and the filtered velocity (m, 3) there.
     """
 
@@ -77,8 +77,8 @@ class TrainingFrame:
     acceleration, density_rate : true rates (n, 3) and (n,); no density rate if no term reads the density.
     later : the filtered flow for the field loss; without it that loss compares with the true particles.
 
-    `acceleration_rms` and `density_rate_rms` are their rms over all ranks, of one component; `total` is the number of
-    particles of all ranks.
+    `acceleration_rms` and `density_rate_rms` are the rms of one component of the true rates over all ranks. `total` is
+    the number of particles of all ranks.
     """
 
     def __init__(self, dynamics: ParticleDynamics, particles: ParticleSet, acceleration: Tensor,
@@ -110,7 +110,7 @@ class TrainingFrame:
         return velocity * (self.model.flow.scales.filter_width / self._rms(velocity)[0] ** 3)
 
     def rows(self, ids: np.ndarray) -> Tensor:
-        """Rows of those of the given particles that this rank owns."""
+        """Rows of the particles with these ids that this rank owns."""
         wanted = torch.from_numpy(ids).to(self._sorted_ids.device)
         place = torch.searchsorted(self._sorted_ids, wanted)
         inside = place < len(self._sorted_ids)
@@ -142,7 +142,7 @@ class TrainingFrame:
     def errors(self, rows: Tensor | None = None, density: Tensor | None = None) -> dict[str, Tensor]:
         """Predicted minus true "acceleration" (k, 3) and, if the model has one, "density_rate" (k,); collective.
 
-        They are at all owned particles, or at `rows`, with the density that terms give, or with another `density` (n,).
+        They are for all owned particles, or for `rows` (k,). `density` (n,) replaces the density that terms give.
         """
         chosen = slice(None) if rows is None else rows
         rates = self.dynamics.rates(self.particles, rows, self.kept, density)
@@ -170,7 +170,8 @@ class ForceTrainer:
     model, frames : all frames are on the same slabs.
     kernel : of the field loss; None without that loss. The grid of the loss has about as many points as there are
         particles, or is the grid of the filtered field.
-    weights : of the losses. batch : number of particles in a step without the field loss.
+    weights : of the losses.
+    batch : number of particles in a step without the field loss.
     """
 
     def __init__(self, model: LagrangianModel, frames: Sequence[TrainingFrame], kernel: SmoothingKernel | None,
@@ -262,7 +263,7 @@ class ForceTrainer:
         return shares
 
     def _power_share(self, frame: TrainingFrame, rows: Tensor, error: Tensor, count: int) -> Tensor:
-        """((d / u'^3) <u . (a - a_true)>)^2, the mean over `count` particles: the squared error of the power.
+        """((d / u'^3) <(v - <v>) . (a - a_true)>)^2, <.> the mean over particles: the squared error of the power.
 
         Coefficients that are fitted to accelerations alone drain too little energy: the features are noisy, so that
         the regression is attenuated.
@@ -271,8 +272,8 @@ class ForceTrainer:
         return power.square().sum() / self.comm.size  # every rank has the whole, so its share is an equal part
 
     def _field_share(self, frame: TrainingFrame, rows: Tensor, error: Tensor, inside: Tensor) -> Tensor:
-        """Eq. 13 per time step: squared error of the kernel average <.> at some grid points of all ranks, over the mean
-        square of the acceleration.
+        """Eq. 13 per time step: squared error of the kernel average <.> at some grid points of all ranks, divided by
+        the mean square of the acceleration.
 
         Without a field the error is <a - a_true> at the true positions: both velocities one step ahead are averaged by
         the kernel. The kernel's own error is far larger than the change in a step, and the force cannot correct it.

@@ -31,7 +31,7 @@ class KernelSample:
     particles : with their velocities.
     field, gradient : velocity (m, 3) and gradient (m, 3, 3) [component, direction] at the m grid points, z slowest.
 
-    `mean_square` holds the mean squares of a component of both, over the whole grid.
+    `mean_square` holds the mean squares of a component of the velocity and of the gradient, over the whole grid.
     """
 
     def __init__(self, particles: ParticleField, field: Tensor, gradient: Tensor) -> None:
@@ -40,13 +40,13 @@ class KernelSample:
         self.mean_square = self._mean_squares(self.field, self.gradient)
 
     def own_rows(self, points: np.ndarray) -> Tensor:
-        """Rows of those of the given points (numbers in the whole grid, z slowest) that lie in this slab."""
+        """Rows of the points that lie in this slab; `points` are numbers in the whole grid, z slowest."""
         n = self.decomposition.planes
         own = points[(points // n**2 >= self.decomposition.start) & (points // n**2 < self.decomposition.stop)]
         return torch.from_numpy(own - self.decomposition.start * n**2)
 
     def errors_of(self, velocity: Tensor, gradient: Tensor) -> tuple[float, float]:
-        """Normalised L2 errors of a reconstruction (m, 3) and (m, 3, 3) over the whole grid; collective."""
+        """Normalised L2 errors of a velocity (m, 3) and gradient (m, 3, 3) over the whole grid; collective."""
         squares = self._mean_squares(velocity - self.field, gradient - self.gradient)
         return tuple(np.sqrt(np.array(squares) / self.mean_square))
 

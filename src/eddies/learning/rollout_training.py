@@ -46,7 +46,7 @@ class RolloutTrainer:
     """Trains a model on rollouts from true initial states.
 
     Every step draws a window from (seed, step) and advances all its particles by the integrator of the simulation. The
-    loss of frame k is <|v - v_true|^2> / <|v_true - v_start|^2>, 1 for particles without acceleration, so that all
+    loss of frame k is <|v - v_true|^2> / <|v_true - v_start|^2>. It is 1 for particles without acceleration, so all
     frames count alike. A density whose rate is learned has the same loss.
 
     The energy loss is the mean over bands of wavenumbers of the squared error of the band's kinetic energy, in units of
@@ -60,7 +60,7 @@ class RolloutTrainer:
     ----------
     integrator : of dynamics with fixed ranks.
     windows : on the slabs of the dynamics.
-    frame_interval : time between frames. steps_per_frame : time steps in it.
+    frame_interval, steps_per_frame : time between frames, and number of time steps in it.
     energy_weight : of the energy loss; if it is zero, windows need no energies.
     resolution : gives the energies of particles; unused if the weight is zero.
     stationary : whether the flow is forced, so that its bands lose no energy on average; the rms change of a band's

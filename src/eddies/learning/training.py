@@ -26,9 +26,9 @@ class Phase:
     work : cost of each optimiser step, in a unit common to all phases, to estimate the time left.
     rates : learning rate of the first and of the last step.
     take : takes one step of the optimiser, given its number within the phase; returns losses by name.
-    validate : error on held-out data; the phase ends with the state of least error. None: with the last state.
+    validate : error on held-out data; the phase ends with the state of least error, or if None with the last.
     validate_every : steps between two validations; the last step is validated too.
-    patience : the phase ends after so many steps without a smaller validation error. None: it takes all steps.
+    patience : the phase ends after this many steps without a smaller validation error; if None, after all steps.
     """
 
     name: str

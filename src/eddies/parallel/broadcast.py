@@ -18,7 +18,10 @@ def first_complaint(comm: MPI.Comm, complaint: str | None) -> str | None:
 
 
 def require_same(comm: MPI.Comm, own: str, words: str) -> None:
-    """Raise UserError on all ranks if one has another text than rank 0. `words` describes the text, {} in its place."""
+    """Raise UserError on all ranks if the text `own` of one rank differs from that of rank 0.
+
+    `words` describes the text in the message of the error; {} in it stands for the text.
+    """
     first = on_first_rank(comm, lambda: own)
     complaint = first_complaint(comm, None if own == first else (
         f"rank {comm.rank} was started with {words.format(own)}, rank 0 with {words.format(first)}; start all ranks "
@@ -30,7 +33,7 @@ def require_same(comm: MPI.Comm, own: str, words: str) -> None:
 def on_first_rank(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
     """Run an action on rank 0 only and return its result on every rank. With a single rank no message is sent.
 
-    All ranks raise the UserError or OSError that it raises.
+    If the action raises UserError or OSError, all ranks raise this error.
     """
     result: Any = None
     error: Exception | None = None
@@ -54,7 +57,7 @@ def on_first_rank(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
 def on_all_ranks(comm: MPI.Comm, action: Callable[[], Result], kind: type[Exception] = OSError) -> Result:
     """Run an action on all ranks and return its result on this one.
 
-    If it raises an error of the class `kind` on some ranks, all ranks raise it with the text of the lowest of these.
+    If the action raises an error of class `kind` on some ranks, all ranks raise it with the text of the lowest one.
     """
     result: Any = None
     complaint = None
@@ -69,7 +72,7 @@ def on_all_ranks(comm: MPI.Comm, action: Callable[[], Result], kind: type[Except
 
 
 def _arguments(error: Exception | None) -> tuple:
-    """Return the arguments that give an error the same text on another rank; empty for no error."""
+    """Return the arguments that give an error the same text on another rank; empty if there is no error."""
     if isinstance(error, OSError) and error.errno is not None:
         return error.errno, error.strerror, error.filename and str(error.filename)
     return () if error is None else (str(error),)

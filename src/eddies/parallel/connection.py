@@ -17,7 +17,7 @@ PATIENCE = 5.0  # seconds that a rank waits for the others to reach the same err
 
 
 class NotConnected(UserError):
-    """MPI connects fewer ranks than were started; `first` tells whether this rank is the first of them."""
+    """MPI connects fewer ranks than were started; `first` tells whether the launcher calls this rank 0."""
 
     def __init__(self, message: str, first: bool) -> None:
         super().__init__(message)
@@ -27,7 +27,7 @@ class NotConnected(UserError):
 def require_connected(world: MPI.Comm) -> None:
     """Raise NotConnected if the launcher has started more ranks than `world` has.
 
-    Without a launcher, or if it gives no number, the check passes.
+    Without a launcher, or if the launcher gives no number of ranks, the check passes.
     """
     names = list(LAUNCHERS)[:1] if SHELL in os.environ else LAUNCHERS
     size = next((name for name in names if os.environ.get(name, "").isdecimal()), None)

@@ -10,17 +10,17 @@ from eddies.parallel.slab import SlabDecomposition
 
 
 class HaloError(UserError, ValueError):
-    """A slab is thinner than the halo, or a particle is not finite or too far outside its slab for the ghosts."""
+    """A slab is thinner than the halo, or a particle is not finite or farther outside its slab than ghosts allow."""
 
 
 class HaloExchange:
-    """Ghost particles: the neighbours' particles within `width` of this slab. Planned once, applied to any column.
+    """Ghost particles: the neighbours' particles within `width` of this slab. Planned once, used for any column.
 
     Parameters
     ----------
-    decomposition : slabs.
+    decomposition : the slabs of all ranks.
     positions : (n, 3), owned particles with z within this rank's slab.
-    width : distance beyond its faces that a rank needs to see.
+    width : a rank needs the particles up to this distance beyond the faces of its slab.
 
     Each rank sends the particles near its lower face down and those near its upper face up. The two faces stay
     separate even if both neighbours are the same rank: a particle then may have two images, which differ in z by a
@@ -60,11 +60,11 @@ class HaloExchange:
         return ghosts
 
     def adjoint(self, ghosts: np.ndarray) -> np.ndarray:
-        """Apply the transpose of `forward`: return the sums (n, ...) of ghost rows (count, ...) by owned row."""
+        """Apply the transpose of `forward`: return for each owned row the sum of its ghost rows, (n, ...)."""
         ghosts = np.asarray(ghosts)
         slab, tail = self.decomposition, ghosts.shape[1:]
         owned = np.zeros((self.owned, *tail), ghosts.dtype)
-        # Each owned row occurs once per face, so plain indexed addition is exact.
+        # An owned row occurs at most once per face, so indexed addition leaves out no ghost.
         owned[self._down] += _exchange(slab, ghosts[: self._from_above], slab.above, slab.below,
                                        (len(self._down), *tail))
         owned[self._up] += _exchange(slab, ghosts[self._from_above :], slab.below, slab.above, (len(self._up), *tail))
@@ -72,10 +72,10 @@ class HaloExchange:
 
 
 class PlaneHalo:
-    """Ghost planes: `below` and `above` planes of the neighbouring slabs, periodically, around this rank's planes.
+    """Ghost planes of the neighbouring slabs: `below` planes under this rank's planes, and `above` planes over them.
 
-    With a single rank its own planes are the ghosts, and no message is sent. Raises HaloError if a
-    slab has fewer planes than either number.
+    Neighbours are periodic. With a single rank its own planes are the ghosts, and no message is sent. Raises HaloError
+    if a slab has fewer planes than `below` or `above`.
     """
 
     def __init__(self, decomposition: SlabDecomposition, below: int, above: int) -> None:
@@ -99,7 +99,7 @@ class PlaneHalo:
         return [below, planes, above]
 
     def adjoint(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """Apply the transpose of `forward`: add ghost planes on their owners, in place, to planes (c, z_local, ...)."""
+        """Apply the transpose of `forward`: add ghost planes in place to their owners' planes (c, z_local, ...)."""
         highest, planes, lowest = parts
         slab, count = self.decomposition, planes.shape[1]
         if slab.size > 1:
@@ -124,7 +124,7 @@ def _require_planes(slab: SlabDecomposition, needed: int, purpose: str) -> None:
 
 def _exchange(slab: SlabDecomposition, sent: np.ndarray, destination: int, source: int,
               shape: tuple[int, ...]) -> np.ndarray:
-    """Send an array to one neighbour and return the array of this shape that another one sends."""
+    """Send an array to `destination` and return the array of this shape that `source` sends."""
     received = np.empty(shape, sent.dtype)
     slab.comm.Sendrecv([np.ascontiguousarray(sent), MPI.BYTE], destination, recvbuf=[received, MPI.BYTE],
                        source=source)

@@ -16,8 +16,8 @@ class ParticleLossError(RuntimeError):
 class Redistribution:
     """Sends each row to a given rank; planned once, applied to any column.
 
-    `destination` (n,) is the rank that each row goes to. Received rows are in the order of their source ranks, and
-    then in the order that they had there. With a single rank no message is sent.
+    `destination` (n,) is the rank that each row goes to. Received rows are sorted by
+    source rank, and rows from one rank keep their order. With a single rank no message is sent.
     """
 
     def __init__(self, comm: MPI.Comm, destination: np.ndarray) -> None:
@@ -74,7 +74,7 @@ def migrate(decomposition: SlabDecomposition, columns: dict[str, np.ndarray]) ->
     moved = {name: migration.apply(column) for name, column in columns.items()}
     after = census(decomposition.comm, moved["id"])
     if before != after:
-        raise ParticleLossError(f"migration changed (count, id sum, id parity) from {before} to {after}")
+        raise ParticleLossError(f"migration changed (count, sum of ids, exclusive-or of ids) from {before} to {after}")
     return moved
 
 
@@ -87,7 +87,7 @@ def id_block(comm: MPI.Comm, total: int) -> tuple[int, int]:
 class IdOrder:
     """Moves particles from any distribution into blocks of consecutive ids, one block per rank.
 
-    `ids` (n,) are this rank's; the ids of all ranks are 0 ... total - 1, each once. `start` and `stop` bound the
+    `ids` (n,) are this rank's ids. Over all ranks, each id 0 ... total - 1 occurs once. `start` and `stop` bound the
     block that `apply` returns. Raises ParticleLossError if an id of the block is missing or occurs twice.
     """
 

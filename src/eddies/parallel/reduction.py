@@ -30,7 +30,7 @@ def global_min(comm: MPI.Comm, value: ArrayLike) -> np.ndarray:
 
 
 def any_rank(comm: MPI.Comm, condition: bool) -> bool:
-    """Return, on every rank, whether the condition holds on at least one."""
+    """Return, on every rank, whether the condition holds on at least one rank."""
     return bool(_reduce(comm, np.int32(bool(condition)), MPI.MAX))
 
 

@@ -1,4 +1,4 @@
-"""Slab decomposition: grid planes and particles are shared among ranks by one block rule."""
+"""Slab decomposition: grid planes and particles are distributed over ranks by the same rule."""
 
 import numpy as np
 from mpi4py import MPI
@@ -17,8 +17,8 @@ def block_starts(total: int, parts: int) -> np.ndarray:
 class SlabDecomposition:
     """Slabs of a periodic cube of side `length`, cut along z into blocks of `planes` equal layers.
 
-    A particle and the grid planes around it are on the same rank. `start`, `stop` and `count` are this rank's planes,
-    `lower` and `upper` its bounds in z, `below` and `above` the neighbouring ranks.
+    A particle and the grid planes around it are on the same rank. This rank owns the `count`
+    planes start, ..., stop - 1, between `lower` and `upper` in z. `below` and `above` are the neighbouring ranks.
     """
 
     def __init__(self, comm: MPI.Comm, length: float, planes: int) -> None:

@@ -39,7 +39,7 @@ class StopRequest:
     Parameters
     ----------
     comm : communicator of the job.
-    signals : numbers of the signals that this rank has received; a handler appends to it.
+    signals : numbers of the signals that this rank has received; a handler appends to this list.
     stop_file : file that rank 0 looks for at most once a second, and removes when the job stops.
     max_seconds : wall time from now on after which the job stops.
     checkpoint_seconds : wall time between two checkpoints.
@@ -56,7 +56,7 @@ class StopRequest:
 
     @contextlib.contextmanager
     def watching(self, lock_lost: LockLoss) -> Iterator[None]:
-        """Within this context, the next call raises on all ranks the error that `lock_lost` returns on rank 0."""
+        """Within this context, a call raises, on all ranks, the error that `lock_lost` returns on rank 0."""
         self._lock_losses.append(lock_lost)
         try:
             yield

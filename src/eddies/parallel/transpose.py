@@ -11,7 +11,7 @@ class Transpose:
 
     As planes a rank has a block of z and all of y; as columns it has all of z and a block of y, by the rule of
     `block_starts`. `column_blocks[r]` (components, planes of r, own columns, x) and `plane_blocks[r]` (components, own
-    planes, columns of r, x) are filled and read in place. A rank's own block is the same memory on both sides.
+    planes, columns of r, x) are filled and read in place. A rank's own block is the same memory in both lists.
 
     Parameters
     ----------
@@ -35,11 +35,11 @@ class Transpose:
             [(components, z_counts[rank], y, width) for y in y_counts], rank, own)
 
     def to_planes(self) -> None:
-        """Send each column block to a plane block of its rank; collective."""
+        """Send column block r to rank r, where it becomes a plane block; collective."""
         self._exchange(self._columns, self._column_lines, self._planes, self._plane_lines)
 
     def to_columns(self) -> None:
-        """Send each plane block to a column block of its rank: inverse and adjoint of `to_planes`."""
+        """Send plane block r to rank r, where it becomes a column block: inverse and adjoint of `to_planes`."""
         self._exchange(self._planes, self._plane_lines, self._columns, self._column_lines)
 
     def _exchange(self, sent: np.ndarray, sent_lines: np.ndarray, received: np.ndarray,
@@ -52,7 +52,7 @@ class Transpose:
 
 
 def _blocks(shapes: list[tuple[int, ...]], rank: int, own: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return the memory that is sent or received, and its blocks of the given shapes; the rank's own one is `own`."""
+    """Return the memory that is sent or received, and its blocks of the given shapes; the block of `rank` is `own`."""
     sizes = [0 if index == rank else int(np.prod(shape)) for index, shape in enumerate(shapes)]
     flat = np.empty(sum(sizes), own.dtype)
     parts = np.split(flat, np.cumsum(sizes)[:-1])

@@ -62,7 +62,7 @@ class ParticleDynamics:
         self._local = None
 
     def built_at(self, particles: ParticleSet) -> Tensor | None:
-        """Positions (n, 3) of these particles at the last build of halo and list; None if there is none for them."""
+        """Positions (n, 3) of these particles at the last build of halo and list; None if it was not for them."""
         return None if self.neighborhood is None else self.neighborhood.built_at(particles)
 
     def rebuild(self, particles: ParticleSet, built_at: Tensor) -> None:

@@ -12,7 +12,7 @@ from eddies.particles.particle_set import as_numpy
 
 
 class _GhostExchange(torch.autograd.Function):
-    """Send rows of owned particles to the ranks that see them; in the backward pass, gradients of copies to the owners.
+    """Send rows of owned particles to the ranks that see them. The backward pass sends gradients of copies to owners.
 
     Both directions are collective. If all ranks compute the same expression, with any number of particles, they also
     take part in the backward exchanges in the same order.

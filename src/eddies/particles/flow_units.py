@@ -90,8 +90,8 @@ def resolved_wavenumber(spacing: float, filter_width: float, kolmogorov_length: 
 def allowed_step(angle: float, highest: float, speed: float) -> float:
     """Longest time step for velocities resolved up to a wavenumber k_c = `highest`; infinite at rest.
 
-    In this step a particle with the rms `speed` u' of a component moves by the phase `angle` = k_c u' dt of that wave,
-    in radians.
+    `speed` is the rms u' of a velocity component. In a step dt, a particle with this velocity crosses the phase
+    `angle` = k_c u' dt, in radians, of a wave with the wavenumber k_c.
     """
     return angle / (highest * speed) if speed > 0 else math.inf
 
@@ -120,7 +120,7 @@ class FlowUnits:
 
 
 def measured_scales(comm: Comm, at: Columns, after: Columns, interval: float) -> dict[str, float]:
-    """Rms of velocity, density and their rates over all particles, for vectors of one component; collective.
+    """Rms of velocity, density and their rates over all particles; of vectors, the rms of one component. Collective.
 
     velocity_rms and density_rms (of the fluctuation) at the frame `at`; acceleration_rms and density_rate_rms from the
     change to the frame `after`, an `interval` later. Frames are this rank's rows of `velocity` (n, 3) and, optionally,

@@ -18,7 +18,7 @@ class Integrator:
     """A time stepping scheme.
 
     `memory` holds the rates that a step passes to the next one, with rows as in the particles last returned. `restore`
-    sets it. In a dense scheme a call of `rates` between two steps costs nothing: the next step uses its result.
+    sets it. If `scheme.dense`, a call of `rates` between two steps costs nothing: the next step uses its result.
     """
 
     scheme: Scheme
@@ -47,7 +47,7 @@ class VelocityVerlet(Integrator):
     """Kick-drift-kick velocity Verlet of second order, one evaluation of the rates a step.
 
     Rates may depend on velocity and density. They are evaluated at the values v + dt a that an Euler step predicts for
-    the end of the step (Groot and Warren 1997, lambda = 1). The first half kick of the next step uses them again. A
+    the end of the step (Groot and Warren 1997, lambda = 1). The first half kick of the next step uses the same rates. A
     density with a rate is integrated by the trapezoidal rule; a density that terms give is the last one evaluated. The
     shift velocity is taken at the start of the step, which is of first order.
     """
@@ -55,7 +55,7 @@ class VelocityVerlet(Integrator):
     scheme = SCHEMES["verlet"]
 
     def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:
-        """Particles between two steps and their rates, evaluated here; `memory` has those at a predicted velocity."""
+        """Particles between two steps and their rates, evaluated anew: `memory` has rates at a predicted velocity."""
         if particles is not self._last:  # the last ones are on their ranks already
             particles, _ = self.dynamics.settle(particles)
         return particles, self.dynamics.rates(particles, time=self.dynamics.time)
@@ -113,7 +113,7 @@ class RungeKutta(Integrator):
         return end
 
     def _settled(self, stage: ParticleSet, *others: ParticleSet) -> list[ParticleSet]:
-        """Move the particles of a stage to the ranks of their slabs, with their rows at other stages."""
+        """Move the particles of a stage to the ranks of their slabs, with the rows that they have in `others`."""
         companions = {f"{number} {name}": column for number, other in enumerate(others)
                       for name, column in other.columns().items() if name != "id"}
         stage, moved = self.dynamics.settle(stage, companions)

@@ -14,7 +14,8 @@ from eddies.kernels import kriging as compiled
 from eddies.kernels.library import library
 from eddies.particles.pairs import Pairs
 
-# Rows of weights: for the field, its first and its second derivatives xx, xy, xz, yy, yz, zz; for field and gradient.
+# Rows of weights: for the field; for its first derivatives; for its second derivatives xx, xy, xz, yy, yz, zz; for the
+# field and its first derivatives.
 OWN, FIRST, SECOND, UP_TO_FIRST = 0, slice(1, 4), slice(4, 10), slice(0, 4)
 # Row in SECOND of each entry (j, k) of the matrix of second derivatives.
 PLACES = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
@@ -42,9 +43,9 @@ def covariance(filter_width: float) -> tuple[float, np.ndarray]:
 def interpolated(pairs: Pairs, support: float, filter_width: float, values: Tensor) -> tuple[Tensor, Tensor]:
     """Kriging at points that are no particles: field (n, c) and gradient (n, c, 3) from values (s, c) of the particles.
 
-    The result is sum_j w_j f_j with weights as in `kriging_weights` and b_j = C(|x - x_j|), or its derivatives by x.
-    The weights of the field add up to one and those of the gradient to zero, so a constant is exact. The result is NaN
-    where the equations cannot be solved, and zero where no particle lies within the support.
+    The result is sum_j w_j f_j with weights as in `kriging_weights` and b_j = C(|x - x_j|), or its derivatives with
+    respect to x. The weights of the field add up to one and those of the gradient to zero, so a constant is exact. The
+    result is NaN where the equations cannot be solved, and zero where no particle lies within the support.
     """
     _, weights = kriging_weights(pairs, support, filter_width, sited=False)
     sums = torch.from_numpy(compiled.weighted_sums(library(), pairs.offsets.numpy(), pairs.sender.numpy(), None,

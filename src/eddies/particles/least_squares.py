@@ -24,8 +24,9 @@ class Solution:
 
     Parameters
     ----------
-    modes : (3, kz, ky, kx). at_points : their values (n, 3) at the points.
-    iterations : number of iterations. left : remaining squared residual.
+    modes : (3, kz, ky, kx).
+    at_points : values (n, 3) of the modes at the points.
+    iterations, left : number of iterations, and remaining squared residual.
     """
 
     modes: Tensor
@@ -43,7 +44,8 @@ class LeastSquares:
 
     Parameters
     ----------
-    inside : (kz, ky, kx), the modes to solve for. penalty : (kz, ky, kx), real, 0 for all other modes.
+    inside : (kz, ky, kx), the modes to solve for.
+    penalty : (kz, ky, kx), real, 0 for all other modes.
     """
 
     def __init__(self, grid: FourierGrid, inside: Tensor, penalty: Tensor) -> None:

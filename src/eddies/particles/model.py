@@ -23,7 +23,7 @@ from eddies.particles.terms.resolved_forces import Forcing
 from eddies.particles.terms.term import PairTerm, Term
 from eddies.scene.terms import TermError, TermSettings
 
-#: The classes behind the words of [model] terms: those in the modules of eddies.particles.terms.
+#: The built-in terms by their words in [model] terms: classes in the modules of eddies.particles.terms.
 TERMS: dict[str, type[Term]] = {
     kind.Settings.word: kind
     for module in iter_modules(built_in.__path__)
@@ -34,7 +34,7 @@ FORCING = "injection"
 # What a term must declare in `gives` to return each rate. Pressure modes are ignored unless a term reads the density.
 GIVES_OF = {"acceleration": "acceleration", "force_modes": "acceleration", "density": "density",
             "density_rate": "density_rate", "shift_velocity": "shift_velocity", "shift_acceleration": "shift_velocity"}
-# Particles of a rank on which the effect of parameters is checked: a gradient through all pairs takes much memory.
+# Largest number of particles of a rank in the check of parameters: a gradient through all pairs takes much memory.
 CHECKED = 64
 # The rates that a linear term stores.
 STORED = (*BY_PARTICLE, "density")
@@ -43,7 +43,7 @@ STORED = (*BY_PARTICLE, "density")
 class LagrangianModel(nn.Module):
     """dv_i/dt, and d rho_i/dt if some term gives it, as the sum of terms.
 
-    Terms that do not read the density are evaluated first; the density that they give is the one that others read.
+    Terms that do not read the density are evaluated first, because they may give the density that the others read.
     Inputs that no term reads are not computed. Raises TermError if a term both reads and gives the density.
 
     Parameters
@@ -61,7 +61,7 @@ class LagrangianModel(nn.Module):
                 raise TermError(f'term "{name}": both reads and gives the density; it can do only one of the two')
 
     def forced(self, settings: TermSettings | None) -> LagrangianModel:
-        """Model of the same terms (not copies) and the known forcing of a flow, if it has one."""
+        """Model of the same terms (not copies) plus a forcing with these settings; this model if they are None."""
         if settings is None:
             return self
         return LagrangianModel({**self.terms, FORCING: Forcing(settings, self.flow)}, self.flow)
@@ -101,14 +101,14 @@ class LagrangianModel(nn.Module):
 
     @property
     def regresses_density(self) -> bool:
-        """Whether a density rate is learned, and from the rates at single moments alone."""
+        """Whether a density rate is learned from the rates at single moments alone, not through several steps."""
         through_horizons = any("density_rate" in term.settings.gives and term.settings.learns_through_horizons
                                for term in self.terms.values())
         return self.learns_density and not through_horizons
 
     @property
     def networks(self) -> list[PairTerm]:
-        """The terms with a network of pairs; their `features` are its inputs."""
+        """The terms with a network of pairs. Their method `features` returns the inputs of the network."""
         return [term for term in self.terms.values() if isinstance(term, PairTerm) and hasattr(term, "features")]
 
     @property
@@ -124,8 +124,8 @@ class LagrangianModel(nn.Module):
         """Sum of the terms; differentiable, collective.
 
         The result has `acceleration` (k, 3), which includes `force_modes`, and `density_rate` (k,) and a shift if a
-        term gives them. A `density` that terms give is the whole density (n,), not its deviation. `kept` replaces
-        terms; see `linear_rates`.
+        term gives them. A `density` that terms give is the whole density (n,), not its deviation. `kept` are
+        results of `linear_rates` that replace terms.
         """
         kept, sums = kept or {}, []
         for stage in self._stages if self.density_is_given and context.density is None else [list(self.terms.items())]:
@@ -144,7 +144,7 @@ class LagrangianModel(nn.Module):
 
     @torch.no_grad()
     def linear_rates(self, context: Context) -> dict[str, LinearRates]:
-        """Effect of each parameter at given particles, by name of the linear terms; collective.
+        """Rates of each linear term as a function of its parameters, by name of the term; collective.
 
         Terms that read a density given by others are left out. Training stores the result for a frame.
         """

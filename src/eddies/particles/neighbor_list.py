@@ -98,7 +98,7 @@ class NeighborList:
         return Pairs(receiver, segment, sender, displacement.T, distance, len(numbers))
 
     def _difference(self, receivers: Tensor, senders: Tensor, receiver: Tensor, sender: Tensor) -> list[Tensor]:
-        """Components of x_i - x_j between nearest images. One at a time is faster than (m, 3) rows."""
+        """Components of x_i - x_j between nearest images. Single components are faster than (m, 3) rows."""
         return [self.box.nearest_image(x.index_select(0, receiver) - y.index_select(0, sender), axis)
                 for axis, (x, y) in enumerate(zip(receivers.unbind(1), senders.unbind(1)))]
 

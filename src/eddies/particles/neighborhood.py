@@ -34,8 +34,8 @@ class LocalParticles:
         self._kriging: Kriging | None = None
 
     def fit(self, owned: Tensor) -> bool:
-        """Whether these quantities are still valid: for this unchanged tensor of owned positions, the present halo and
-        list, and gradients recorded or not as now. All ranks get the same answer."""
+        """Whether these quantities are still valid: the tensor of owned positions, halo and list have not changed, and
+        gradients are recorded as before or again not recorded. All ranks get the same answer."""
         return self._owned is owned and self._state == self._state_of(owned)
 
     def _state_of(self, owned: Tensor) -> tuple[int, int, bool]:
@@ -45,7 +45,7 @@ class LocalParticles:
     def position(self) -> Tensor:
         """Positions (s, 3) of the owned particles, then of the ghosts.
 
-        On several ranks z is not periodic here, and ghosts have the z at which the slab sees them.
+        On several ranks z is not periodic here: the z of ghosts beyond the periodic face is shifted by one period.
         """
         # Stored component by component, which is faster for the gathering of pairs.
         return with_ghosts(self.neighborhood.halo, self._owned, positions=True).T.contiguous().T
@@ -87,7 +87,7 @@ class Neighborhood:
         self._ids: Tensor | None = None
 
     def built_at(self, particles: ParticleSet) -> Tensor | None:
-        """Positions (n, 3) of these particles at the last build; None if it was for others. No message is sent."""
+        """Positions (n, 3) of these particles at the last build; None if it was for other particles. Not collective."""
         return self._built_at if particles.id is self._ids else None
 
     def outdated(self, particles: ParticleSet) -> bool:
@@ -102,7 +102,7 @@ class Neighborhood:
         """Rebuild halo and list if they are outdated. No particle changes rank.
 
         Where a particle has left its slab, the halo is wider by the largest distance outside. Slabs must be thicker by
-        twice that distance: two particles may enter a slab from both sides, and their ranks do not see each other.
+        twice that distance: particles of both neighbouring ranks may enter a slab, and these ranks exchange no ghosts.
         Raises HaloError on all ranks if slabs are too thin, a position is not finite, or a particle is farther outside
         its slab than the box is long.
         """

@@ -183,8 +183,8 @@ def compiled_sums(space: PairSpace, summands: Sequence[CompiledSum], parities: S
                   velocity: Tensor | None, wanted: np.ndarray, dtype: torch.dtype) -> tuple[Tensor, ...]:
     """Sums (components, s) of each summand over the neighbours of the particles `wanted`, bool (s,); differentiable.
 
-    The sums of other particles are undefined. `parities` are those of PairSum. `position` and `velocity` (s, 3) are
-    those of all particles that this rank sees. Raises ValueError if a position is not finite.
+    The sums of other particles are undefined. `parities` are the `parity` of each PairSum. `position` and `velocity`
+    (s, 3) belong to all particles that this rank sees. Raises ValueError if a position is not finite.
     """
     columns: list[Tensor] = []
     placed = []

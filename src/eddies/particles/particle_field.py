@@ -56,8 +56,8 @@ class ParticleField:
 
     @torch.no_grad()
     def volumes(self, kernel: SmoothingKernel) -> Tensor:
-        """Volumes 1 / sum_j W(x_i - x_j), i included, or the kernel's mean volume, of all local particles (s,);
-        collective."""
+        """Volumes (s,) of all local particles: 1 / sum_j W(x_i - x_j), including j = i, or the kernel's mean volume.
+        Collective."""
         if kernel.mean_volume is not None:
             return self._velocity.new_full((len(self._position),), kernel.mean_volume)
         sums = self._sums(kernel, "kernel-sum", 1, self._position, len(self.owned))[0]
@@ -84,12 +84,12 @@ class ParticleField:
         pairs = self._around.pairs(self.points, self._position, rows, self.dtype)
         return reconstruct_with_gradient(kernel, pairs, volume, self._velocity)
 
-    # ---- without a gradient of the result, by the compiled library
+    # ---- methods that record no gradient, by the compiled library
 
     @torch.no_grad()
     def averaged(self, kernel: SmoothingKernel, volume: Tensor, receivers: Tensor) -> tuple[Tensor, Tensor]:
-        """Average velocity (k, 3) and gradient (k, 3, 3) [component, direction] at any points of this rank, with the
-        kernel's `volumes`."""
+        """Average velocity (k, 3) and gradient (k, 3, 3) [component, direction] at any points of this rank; `volume`
+        is the result of `volumes` for this kernel."""
         columns = torch.cat([volume.unsqueeze(1), self._velocity], dim=1)
         columns = torch.cat([columns.new_zeros(len(receivers), 4), columns])
         sums = self._sums(kernel, "kernel-average", 16, torch.cat([receivers, self._position]), len(receivers),
@@ -119,8 +119,8 @@ class ParticleField:
             V sum_j W(x - x_j) |p(x_j) - A_j|^2 + RIDGE (sum of the squares of all coefficients except the constant)
 
         with V the `mean_volume` of a particle, so that V sum_j W is one on average. W must not be negative. Where
-        neighbours are few, distant or badly placed, the ridge dominates and leaves the average with the weight W. The
-        result is zero where no particle lies within the support.
+        neighbours are few, distant or badly placed, the ridge dominates and the result is close to the average with the
+        weight W. It is zero where no particle lies within the support.
         """
         neighbors = self._neighbors_of(receivers)
         values = fitted(library(), self._box, degree, _for_library(kernel), mean_volume, RIDGE,

@@ -14,7 +14,7 @@ from eddies.kernels.neighbors import Box
 class PeriodicBox(Box):
     """Cube of side `length`, periodic in x and y, and in z unless `periodic_z` is False.
 
-    With several ranks z is an ordinary coordinate in a slab: the ghosts arrive with the z at which the slab sees them.
+    On several ranks z is not periodic within a rank: the z of ghosts beyond the periodic face is shifted by one period.
     """
 
     periodic_z: bool = True

@@ -21,7 +21,7 @@ class Rates:
     density_rate : (n,), rate of change of their density.
     density : (n,), part of the deviation of their density from the mean, if terms give the density instead of its rate.
     force_modes : Fourier modes (3, kz, ky, kx) of an acceleration on the grid of the resolved velocity.
-    pressure_modes : modes (kz, ky, kx) of a pressure p over the mean density, which adds p / c^2 to the density.
+    pressure_modes : modes (kz, ky, kx) of a pressure p divided by the mean density; p / c^2 is added to the density.
     shift_velocity : (n, 3), velocity of the particles relative to the fluid, dx/dt = v + shift_velocity.
     shift_acceleration : (n, 3), change of the fluid velocity v at a particle due to the shift.
 

@@ -33,9 +33,11 @@ class RememberedVelocity:
 
     Parameters
     ----------
-    solver : for the first frame, which has no forecast; grid, prior and tolerance of all frames.
-    viscosity : nu. transfer : G (kz, ky, kx) of the filter of the velocity that particles follow; 1 for the whole flow.
-    memory : C. weight : factor of the noise in the solver, sigma^2 / e; here a value below 1 is replaced by 1.
+    solver : estimates the first frame, which has no forecast. Its grid, prior and tolerance serve all frames.
+    viscosity : nu.
+    transfer : G (kz, ky, kx) of the filter of the velocity that particles follow; 1 for the whole flow.
+    memory : C.
+    weight : factor of the noise in the solver, sigma^2 / e; here a value below 1 is replaced by 1.
 
     All methods are collective.
     """

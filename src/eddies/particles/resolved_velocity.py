@@ -27,11 +27,11 @@ from eddies.spectral.mode_operators import gaussian_transfer
 # between the expected unresolved energy and the noise. The factor is measured in docs/closure.md.
 EXPONENT, DISSIPATION, DISSIPATION_ONSET, WEIGHT = 11 / 3, 5.2, 0.4, 100.0
 # Final residuals relative to the velocities, of a solve that starts from zero and of one that starts from a prediction.
-# The residual of the first stays in poorly determined modes, that of the second is spread over all modes. At twice the
-# second value a forced flow diverged (docs/closure.md).
+# A solve from zero leaves its residual in poorly determined modes; a solve from a prediction leaves it in all modes. At
+# twice the second value a forced flow diverged (docs/closure.md).
 TOLERANCE, TOLERANCE_PREDICTED = 2e-4, 1e-3
 # Final residual of the solve in the backward pass, relative to the incoming gradient. Gradients of a loss through four
-# frames then have an error of 2e-3, with half of the iterations that 2e-4 needs.
+# frames then have an error of 2e-3, with half of the iterations of a tolerance of 2e-4.
 TOLERANCE_ADJOINT = 3e-3
 MOST_ITERATIONS = 300
 # Wavenumber shells in a band of the energy.
@@ -180,7 +180,7 @@ class ResolvedVelocity:
     @classmethod
     def on_slabs(cls, decomposition: SlabDecomposition, scales: ReferenceScales, margin: float = 0.0,
                  dtype: torch.dtype | None = None, weight: float = WEIGHT) -> ResolvedVelocity:
-        """Make it on a grid with one cell for each plane of the slabs, in double precision by default.
+        """Make an instance on a grid with one cell for each plane of the slabs, in double precision by default.
 
         Particles may be outside their slab by `margin` at most.
         """
@@ -245,7 +245,7 @@ class ResolvedVelocity:
         """Predict the modes at a time; None without earlier evaluations.
 
         The nearer of the last two evaluations at different times is extrapolated with the rates of both (Adams and
-        Bashforth). It moves with the mean velocity (3,) of the particles. Each mode is reduced by its expected
+        Bashforth). The field moves with the mean velocity (3,) of the particles. Each mode is reduced by its expected
         error. In a time dt a velocity equal to the rms `speed` u' of a component turns the phase of a mode by theta =
         k u' dt. The relative error of the prediction is then (5/12) theta^3; its rms over normally distributed
         velocities is 1.6 theta^3. The factor 1 / (1 + (2 theta)^6) removes modes that velocities of two or three u'
@@ -308,8 +308,8 @@ class ResolvedVelocity:
         return self.equations.solve(flow.points, right, count, enough, self.iterations, self.most_iterations)
 
     def _adjoint(self, flow: ResolvedFlow) -> Callable[[Tensor], Tensor]:
-        """Function that turns the gradient of a loss by the modes u of the minimum into its gradient by the descent
-        d(u; x, v) there.
+        """Function that turns the gradient of a loss with respect to the modes u at the minimum into the gradient with
+        respect to the descent d(u; x, v) there.
 
         d vanishes at the minimum and changes with u by -A, so du = A^-1 dd (implicit function theorem). A is symmetric
         in the inner product that weights modes by their multiplicity m. Its transpose is therefore m A (1/m).

@@ -151,7 +151,7 @@ class HermiteKernel:
         return entries, torch.where(inside, factors, torch.zeros_like(factors)) / self.support**3
 
     def _locate(self, distance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Whether each distance is inside, its cell, and its place in [0, 1] there."""
+        """Whether each distance is within the support, its cell, and its position in the cell, in [0, 1]."""
         position = distance * (self.cells / self.support)
         cell = torch.clamp(position.detach().to(torch.int64), 0, self.cells - 1)
         return distance < self.support, cell, torch.clamp(position - cell, max=1)
@@ -172,11 +172,11 @@ class KernelNetwork(nn.Module):
     cutoff : "smooth": g = (1 - q^2)^2, zero with zero slope at q = 1; or "sigmoid", the paper's
         g = 1/(1 + exp(C (q - 1))), which is 1/2 at q = 1, so the kernel ends with a jump.
     seed : of the initial weights.
-    mean_volume : L^3/N of the published form, which may be negative; None: the positive form.
+    mean_volume : L^3/N, for the published form of W, which may be negative; None for the positive form.
 
     In the published form alpha is part of the output layer, which the loss L_n of Eq. 11 brings to the unit integral.
-    Volumes 1/sum W and normalised averages would fail with it: they do not depend on alpha, and their denominators
-    pass zero where weights of either sign cancel. With positive weights an average lies between the averaged values.
+    Volumes 1/sum W and normalised averages would fail in the published form: they do not depend on alpha, and their
+    denominators pass zero where weights of both signs cancel. With positive weights an average lies between the values.
 
     The positive form is an even function of q, smooth and without slope at r = 0, as the gradient of a reconstructed
     field requires. Its output layer starts small, so W starts near the bell g.

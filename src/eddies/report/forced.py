@@ -21,7 +21,10 @@ SERIES = {"energy": "kinetic energy", "acceleration_rms": "rms of an acceleratio
 
 
 def averages(run: Frames, frames: np.ndarray, turnover: float, whose: str) -> dict[str, dict[str, float]]:
-    """Return for each of SERIES its mean (as `whose`), its slope per turnover, their errors, and its deviation."""
+    """Return for each of SERIES: mean, slope per turnover, standard errors of both, and standard deviation in time.
+
+    The key of the mean is `whose`.
+    """
     blocks, found = Blocks.of(run.times[frames] / turnover, 1.0), {}
     samples = {"energy": np.array([mean_energy(run, frame) for frame in frames]),
                "acceleration_rms": np.array([np.std(run.read(frame, "acceleration")) for frame in frames])}
@@ -40,7 +43,7 @@ def invariant_divergence(model: Sequence[Invariants], flow: Invariants) -> float
 
 
 def section(run: Rollout, span: StationarySpan) -> Section:
-    """Return the section. Averages are those over the second half of the rollout, until the model broke."""
+    """Return the section. Averages are over the second half of the rollout before the model broke."""
     shown, turnover = Section("forced", "Forced rollout beside the stationary state"), run.turnover
     frames = run.before_broken("model")
     if not len(frames):
@@ -123,8 +126,8 @@ def forced_rollout(series: tuple[np.ndarray, np.ndarray], flow: tuple[float, flo
                    accelerations: tuple[np.ndarray, np.ndarray]) -> Figure:
     """Draw energy over time, mean spectra and acceleration PDFs of the model and of the stationary flow.
 
-    series: time / T and energy of the model. flow: mean and deviation of its energy. spectra: wavenumber, flow, model.
-    accelerations: flow and model, standardised.
+    series: time / T and energy of the model. flow: mean and deviation of the energy of the flow. spectra: wavenumbers,
+    and the spectra of flow and model. accelerations: those of flow and model, standardised.
     """
     figure, ((energy, spectrum, density),) = panels(1, 3, (3.6, 3.1))
     mean, deviation = flow

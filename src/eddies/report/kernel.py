@@ -46,7 +46,7 @@ def shapes(kernels: Mapping[str, np.ndarray]) -> Figure:
 
 @styled
 def reconstructed_planes(slices: Mapping[str, np.ndarray], errors: Mapping[str, float]) -> Figure:
-    """Draw planes [y, x] of u_x and du_x/dx, truth and reconstructions, with one colour scale a row."""
+    """Draw planes [y, x] of u_x and du_x/dx, truth and reconstructions, with one colour scale per row."""
     names = [name for name in KERNELS if f"velocity_{name}" in slices and name != "wendland"]
     figure, axes = panels(2, 1 + len(names), (2.665, 2.675), right=BAR, sharex=True, sharey=True)
     rows = (("velocity", "$u_x$"), ("gradient", r"$\partial u_x/\partial x$"))

@@ -56,7 +56,10 @@ def _mark_phases(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
 
 
 def _validation(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
-    """Draw one line per phase, from the error before its first step, since measures differ by phase; circle minima."""
+    """Draw one line of errors for each phase, because the measures of the phases differ, and circle its minimum.
+
+    A line begins with the error before the first step of the phase.
+    """
     axis.set(title="Validation error, minima circled", ylabel="validation error")
     missing, highest = np.full(len(history["step"]), np.nan), 0.0
     after, before = (history.get(name, missing) for name in ("validation_error", "start_error"))

@@ -41,9 +41,9 @@ def section(description: Mapping[str, Any], table: Table, acceleration: Table, d
             history: Table | None, source: str | None = None, others: Sequence[str] = ()) -> Section:
     """Return the section with the errors at the last frame, from the tables of the product.
 
-    source: path of the run that the weights and the history come from, if it is another one.
-    history: None if nothing was trained. others: the ground truths that the model was trained on, if they do not
-    include the one of this flow, or of the source.
+    source: path of the run that the weights and the history come from; None if it is this run.
+    history: None if nothing was trained. others: the ground truths that the model was trained on, if that of this run
+    (or of the run `source`) is not among them.
     """
     last = int(np.argmax(table["delay"]))
     at = {name: float(values[last]) for name, values in table.items()}

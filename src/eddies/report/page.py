@@ -123,7 +123,7 @@ def write_page(output: Path, run: RunRecord, sections: Sequence[Section], images
                beside: Mapping[Path, str]) -> None:
     """Write index.html, metrics.json, figures/NAME.png and the files `beside`, and remove older figures.
 
-    Raises OSError, for example on a full disk. Then no file has changed.
+    Raises OSError, or WriteError if a file cannot be written; then no file has changed.
     """
     earlier = (output / "metrics.json").exists()  # figures of other programs stay
     (output / "figures").mkdir(parents=True, exist_ok=True)
@@ -136,7 +136,7 @@ def write_page(output: Path, run: RunRecord, sections: Sequence[Section], images
 
 
 def render_page(run: RunRecord, sections: Sequence[Section], images: Mapping[str, bytes]) -> str:
-    """Return the page as HTML; `images` holds the PNG images of figures by name. Figures without one are left out."""
+    """Return the page as HTML. `images` holds PNG images by name of the figure; other figures are left out."""
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"shown": shown, "embedded": _embedded}
     template = environment.from_string(Path(__file__).with_name("page.html").read_text(encoding="utf-8"))

@@ -19,8 +19,8 @@ def section(about: Mapping[str, float | str], errors: Mapping[str, np.ndarray], 
             plane: np.ndarray | None) -> Section:
     """Return the section from the tables of the product.
 
-    errors: at tracks left out. of_fields: where the true fields are known; may be empty. plane: u_x [y, x] at z = pi of
-    the last frame.
+    errors: columns over time with the error at tracks left out. of_fields: columns over time with errors of the fields;
+    empty if the true fields are not known. plane: u_x [y, x] at z = pi of the last frame.
     """
     both = {**{name: (of_fields["time"], of_fields[name]) for name in of_fields if name in ERRORS},
             **{name: (errors["time"], errors[name]) for name in errors if name in ERRORS}}
@@ -47,7 +47,7 @@ def section(about: Mapping[str, float | str], errors: Mapping[str, np.ndarray], 
 
 @styled
 def overview(errors: Mapping[str, tuple[np.ndarray, np.ndarray]], plane: np.ndarray | None) -> Figure:
-    """Draw errors over time, pairs of times and values by name, and a plane of u_x if there is one."""
+    """Draw errors over time and, if there is one, a plane of u_x. `errors` holds times and values by name."""
     figure, axes = panels(1, 1 if plane is None else 2, (4.4, 3.3), right=BAR)
     over_time = axes[0, 0]
     for name, (label, colour, style) in ERRORS.items():

@@ -35,7 +35,7 @@ def section(found: Mapping[str, float | str], trials: Trials) -> Section:
 
 @styled
 def convergence(found: Mapping[str, float | str], trials: Trials, size: str) -> Figure:
-    """Draw the change by halving the step over the step, and the error over the seconds per turnover."""
+    """Draw the change by halving the step against the step, and the error against the seconds per turnover."""
     figure, ((change, error),) = panels(1, 2, (4.6, 3.1), foot=0.3)
     for name, columns in trials.items():
         changes = np.maximum(columns["difference"][1:], NO_CHANGE)

@@ -53,7 +53,10 @@ class ErrorAgainstTime:
 
     @property
     def drawn(self) -> list[str]:
-        """The measures of DRAWN that some row has. If no rollout reaches T/2, the velocity error is that at the end."""
+        """The measures of DRAWN that some row has.
+
+        If no rollout reaches T/2, the velocity error at the end replaces the one at T/2.
+        """
         replaced = {} if self.finished("velocity_error_half") else {"velocity_error_half": "velocity_error_end"}
         return [name for name in (replaced.get(name, name) for name in DRAWN) if self.finished(name)]
 

@@ -33,8 +33,8 @@ TEXTBOOK = {"cubic_spline": "cubic spline", "wendland": "Wendland kernel"}
 class Judged:
     """A number and its mark.
 
-    `error` is compared with the largest error that is good and the largest that is fair. `within` writes these limits
-    for the table. `words` name the number in the table, `short` names it in sentences, `baseline_text` describes the
+    `error` is compared with `good` and `fair`, the largest errors with these marks. `within` writes these limits for
+    the table. `words` name the number in the table, `short` names it in sentences, `baseline_text` describes the
     baseline.
     """
 

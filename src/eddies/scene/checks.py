@@ -26,7 +26,8 @@ REQUIRED = {"fluid": ("nonlinear", "linear", "linear_function", "combine", "comp
 RESERVED = ("report", "vtkhdf", "lagrangebench", "STOP", "LOCK")
 REALISATION = "realisation-"
 NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{,99}"
-# Keys that a variant must share with the scene, with the reason. STARTS: if rollouts start after the training window.
+# Keys that a variant must share with the scene, each with the reason. The keys of STARTS count only if rollouts start
+# after the training window.
 SAME_TIMES = "all variants start at the same moment and are compared at the same times; change it for the whole scene"
 SAME_START = ("rollouts start after the training window, and all must start at the same moment; give the scene a "
               "[simulation] start")
@@ -61,7 +62,7 @@ def problem_of_name(variant: str) -> str:
 
 
 def check_foreign(flow: Flow, initial: Initial, simulation: Simulation | None, model: Model | None) -> Problems:
-    """Yield import paths that cannot be loaded, or whose class lacks an attribute. `Model` checks those of terms."""
+    """Yield import paths that cannot be loaded, or whose class lacks an attribute. `Model` checks the terms."""
     sections: dict[str, Section | None] = {"flow": flow, "initial": initial, "simulation": simulation}
     if model:
         sections |= {f"model.{name}": settings for name, settings in model.settings.items()}
@@ -128,7 +129,7 @@ def check_time(time: Time, flow: Flow, forcing: Forcing | None, spin_up: SpinUp 
 
 
 def check_tracers(tracers: Tracers, flow: Flow, initial: Initial) -> Problems:
-    """Yield an initial flow at rest, and stored fields on a finer grid than the flow's."""
+    """Yield a problem if the initial flow is at rest, or if fields are stored on a finer grid than that of the flow."""
     if initial.flow.sound:
         yield "initial.kind", ("starts from rest and has no turnover time, the unit of [tracers] turnovers; choose "
                                "another kind, or remove [tracers]")
@@ -242,7 +243,7 @@ def check_training(training: Training, tracers: Tracers | None, kernel: Kernel |
 
 
 def check_simulation(simulation: Simulation, tracers: Tracers, seen: float) -> Problems:
-    """Yield a frame interval that is no multiple of the step or of that of the tracers, and a missing start.
+    """Yield a frame interval that is no multiple of the step or of the tracers' frame interval, and a missing start.
 
     `seen` is the fraction of the ground truth that training has used.
     """

@@ -11,14 +11,14 @@ class Scheme:
     """A scheme that a scene can name.
 
     `nodes` and `weights` are c and b of a Runge-Kutta scheme whose stages all advance from the beginning of the step,
-    each with the rates of the stage before; other schemes have none. `angle` and `iterations`: see docs/closure.md.
+    each with the rates of the stage before. They are empty for others. `angle`, `iterations`: see docs/closure.md.
     """
 
     name: str
     evaluations: int  # of the rates in a step
-    dense: bool = True  # it can interpolate between steps; if not, frames lie at ends of steps
+    dense: bool = True  # whether it can interpolate between steps; otherwise frames lie at the ends of steps
     angle: float  # largest k_c u' dt at which a velocity resolved up to k_c follows the flow
-    decay: float  # largest product of rate of relaxation and step
+    decay: float  # largest stable product of relaxation rate and time step
     iterations: float  # of the solve for a resolved velocity, per evaluation, at about the longest step
     nodes: tuple[float, ...] = ()
     weights: tuple[float, ...] = ()

@@ -35,7 +35,7 @@ class Layer:
 
     Parameters
     ----------
-    values : new values by dotted key, such as "flow.cells"; an empty table makes an absent section.
+    values : new values by dotted key, such as "flow.cells"; an empty table adds a section that is absent.
     unset : dotted keys and sections that are removed first.
     """
 
@@ -59,7 +59,7 @@ class Layer:
     def apply(self, document: Document) -> None:
         """Change the document in place.
 
-        Raises SceneError if a key to remove is missing, or if a key belongs to a section that is a value.
+        Raises SceneError if a key to remove is missing, or if the document has a value where a key needs a section.
         """
         for removal in self.unset:
             self._remove(document, removal)
@@ -104,7 +104,7 @@ def with_sections(key: str) -> Iterator[str]:
 
 
 def read_document(name_or_path: str, above: Sequence[Path] = ()) -> tuple[Path, Document]:
-    """Return the file of a scene, and its document merged over its bases. `above` are the files that have it as a base.
+    """Return the file of a scene, and its document merged over its bases. `above`: the files based on this scene.
 
     Variants of a scene replace those of its base. Raises SceneError if there is no such scene, a file is not TOML, or a
     scene is its own base.
@@ -217,7 +217,7 @@ def _parsed(value: str) -> Any:
 def check_command_line(given: Layer, variants: Mapping[str, Layer], existing: Iterable[str]) -> None:
     """Raise SceneError if the command line changes an unknown variant, or a key that a variant changes itself.
 
-    The error names the option that reaches this one variant.
+    The error names the option that changes the key in this variant alone.
     """
     for option, keys in (("--set", given.values), ("--unset", given.unset)):
         for key in keys:

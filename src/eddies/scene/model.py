@@ -25,8 +25,8 @@ def built_in_weights() -> list[str]:
 class Model(Section):
     """The terms whose sum moves the particles, each with its settings; a preset is a named list of terms.
 
-    When the section is made, the preset gives `terms` and the absent keys of their `settings`, and becomes None. A
-    program gives settings as objects or as dicts.
+    When the section is made, the preset gives `terms` and the absent keys of their `settings`, and `preset` is set to
+    None. A program gives settings as objects or as dicts.
     """
 
     preset: str | None = choice(f"name of a predefined list of terms; absent: {DEFAULT_PRESET}, unless terms is given",

@@ -47,7 +47,7 @@ class Rule:
     kind : type of the value, or of each entry of a list: float, int, bool or str.
     about : meaning of the key in one line.
     bounds : interval of a number.
-    words : allowed strings, besides numbers or alone; if there are none, any string is allowed.
+    words : allowed strings; a number key allows them besides numbers. A string key without words allows any string.
     paths : whether the import path "module:name" of a user's own class is allowed too.
     many : whether the value is a list, held as a tuple.
     """

@@ -88,7 +88,7 @@ class Scene(Section):
     def realisation(self, seed: int) -> "Scene":
         """The scene with another seed.
 
-        An initial flow of kind file is read from the file of the same name in realisation-SEED beside it.
+        An initial flow of kind file is then read from realisation-SEED/NAME in the directory of its file NAME.
         """
         start = self.initial
         if start.flow.from_file and start.file is not None:
@@ -334,7 +334,7 @@ class Scene(Section):
         return "\n".join(lines) + "\n"
 
     def differences(self, name: str) -> Iterator[str]:
-        """Yield the lines of a variant's table: the keys in which it differs, `key = value`."""
+        """Yield the lines of a variant's table: `unset`, and `key = value` for each key that differs from the scene."""
         own, other = (dict(dotted(tomllib.loads("\n".join(write_section(scene)))))
                       for scene in (self.without_variants, self.variant[name]))
         for key in set(SCENE_ONLY_KEYS) & {*own, *other}:

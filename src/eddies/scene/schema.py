@@ -17,7 +17,7 @@ LIMITS = {"above": "exclusiveMinimum", "at_least": "minimum", "below": "exclusiv
 def json_schema() -> dict[str, Any]:
     """Return the JSON schema (draft 2020-12) of a scene file.
 
-    It requires no key, because a base may give it. The keys of users' own terms are unknown, so it accepts any.
+    The schema requires no key, because a base may give it. It accepts any key in the sections of users' own terms.
     """
     schema = _object(Scene)
     schema["properties"] |= {

@@ -45,7 +45,7 @@ class Flow(Section):
 
     @property
     def components(self) -> int:
-        """Number of fields of the state: velocity, and density of a compressible fluid."""
+        """Number of scalar fields in the state: three of the velocity, and the density of a compressible fluid."""
         return 4 if self.compressible else 3
 
     @property
@@ -64,8 +64,8 @@ class InitialFlow:
     """Properties of an initial flow that are known before it is made."""
 
     keys: tuple[str, ...] = ("amplitude", "peak_wavenumber", "wavenumber", "path", "state")  # keys that it reads
-    rms: float | None = None  # root mean square of |u| over the amplitude; None: unknown, or at rest
-    peak: float | None = None  # largest |u| + |v| + |w| over the amplitude; None: unknown, or at rest
+    rms: float | None = None  # root mean square of |u|, divided by the amplitude; None: unknown, or at rest
+    peak: float | None = None  # largest |u| + |v| + |w|, divided by the amplitude; None: unknown, or at rest
     turbulent: bool = False  # it has many scales, with the spectrum's peak at `peak_wavenumber`
     sound: bool = False  # at rest except for sound waves
     steady: bool = False  # without viscosity it has no acceleration
@@ -111,7 +111,7 @@ class Initial(Section):
 
     @property
     def flow(self) -> InitialFlow:
-        """The properties of the kind."""
+        """The properties of this kind of initial flow."""
         return INITIAL_FLOWS.get(self.kind, InitialFlow())
 
 
@@ -120,8 +120,8 @@ class Tracks(Section):
     """Measured particle tracks, used in place of the direct simulation and its tracers.
 
     Lengths are in the unit of the file, and times in the time unit of its velocities. In the run the edge of the box is
-    2 pi, and the unit of time is the same. Fields are made from all tracks of a frame; models use only the tracks that
-    are present in all frames.
+    2 pi, and times keep this unit. Fields are made from all tracks of a frame; models use only the tracks that are
+    present in all frames.
     """
 
     path: str = text("file with the tracks")
@@ -319,7 +319,7 @@ KERNEL_DEFAULTS = {"form": "kriging", "positive": True, "cutoff": "smooth", "nor
                    "learning_rate": 2e-3}
 KERNEL_PRESETS = {"paper": {"form": "average", "positive": False, "cutoff": "sigmoid", "normalization_weight": 1.0,
                             "learning_rate": 1e-3, "final_learning_rate": 1e-6}}
-# Default ratio of the final learning rate to that at the start.
+# Default ratio of the final to the initial learning rate.
 FINAL_RATE = 0.05
 
 
@@ -444,7 +444,7 @@ class Training(Section):
 
     @property
     def steps_in_all(self) -> int:
-        """Number of optimiser steps, with those through horizons."""
+        """Number of optimiser steps, including the steps through horizons."""
         return self.steps + (self.horizons.steps * len(self.horizons.frames) if self.horizons else 0)
 
     @property

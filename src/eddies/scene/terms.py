@@ -19,10 +19,10 @@ GIVES = ("acceleration", "density", "density_rate", "shift_velocity")
 #: The inputs of a pair network, in units of the flow: the densities of both particles, |x|, |v| and x.v.
 INPUTS = ("density", "distance", "speed", "approach")
 BASES = ("corrected", "paper", "unit")
-# The ratio of the largest rate of relaxation to the nominal rate. The estimate from neighbours has the noise of a
-# particle with the wrong sign, so the ratio is 3.6 to 4.0 among random particles and in turbulence. Two fifths are
-# added for other noise: with 4.2 a flow at M_t = 0.16 diverged after a turnover, with 5.5 one of 256^3 cells after a
-# few steps.
+# The ratio of the largest rate of relaxation to the nominal rate. The estimate from neighbours contains the noise of
+# a particle with the opposite sign, so the ratio is 3.6 to 4.0 among random particles and in turbulence. Two fifths of
+# 4.0 are added for other noise: with 4.2 a flow at M_t = 0.16 diverged after a turnover, with 5.5 a flow on 256^3
+# cells after a few steps.
 NOISE_AMONG_NEIGHBORS = 5.6
 
 
@@ -54,10 +54,10 @@ class TermSettings(Section):
 
     Attributes
     ----------
-    word : its name in scenes; empty for a user's class.
+    word : name of the term in scenes; empty for a user's class.
     reads : any of "pairs" (neighbours within the interaction radius, also for kriging), "resolved" (the velocity on a
-        grid) and "density" (computed, stored, and needed in the ground truth). Only these are computed for it.
-    gives : any of "acceleration", "density" (a part of it), "density_rate" and "shift_velocity".
+        grid) and "density" (computed, stored, and needed in the ground truth). The term gets only what is listed.
+    gives : any of "acceleration", "density" (a contribution to it), "density_rate" and "shift_velocity".
     learns_through_horizons : only training through several steps of the simulation fits its parameters.
     viscous : it needs the viscosity of the fluid.
     damps_by : its parameter with damping rates by wavenumber, which a coarse grid can use; empty: it has none.
@@ -177,7 +177,7 @@ class DensityDiffusion(PairSum):
 
 @dataclass(frozen=True, kw_only=True)
 class Pressure(TermSettings):
-    """The pressure of the resolved velocity: its density, and its force."""
+    """The pressure of the resolved velocity, which gives a density and a force."""
 
     word = "pressure"
     reads = ("resolved",)
@@ -268,7 +268,7 @@ class WCSPH(TermSettings):
                 'sound speed; lower step, and use integrator = "verlet"')
 
     def longest_step(self, units: StepUnits) -> float:
-        """0.4 h / (c (1 + 0.6 alpha)) (Monaghan 1992), h half the kernel's support, c the pressure's speed of sound."""
+        """0.4 h / (c (1 + 0.6 alpha)) (Monaghan 1992); h: half the kernel's support, c: sound speed of the pressure."""
         if units.sound_speed is None:
             return math.inf
         return 0.4 * units.radius / 2 / (self.speed * units.sound_speed * (1 + 0.6 * self.alpha))
@@ -316,14 +316,14 @@ class FilteredEquations(TermSettings):
 TERMS: dict[str, type[TermSettings]] = {kind.word: kind for kind in list(globals().values())
                                         if isinstance(kind, type) and issubclass(kind, TermSettings) and kind.word}
 
-# Near the result of training. With the usual values friction is tens of times the accelerations of turbulence.
+# Values near those that training finds. With the usual ones friction is tens of times the accelerations of turbulence.
 LITTLE_FRICTION = {"alpha": 0.05, "beta": 1.5}
 
 RESOLVED = ("pressure", "stress", "viscosity", "damping", "relaxation")
 
 
 def _published(basis: str, hidden: tuple[int, ...]) -> dict[str, Mapping[str, Any]]:
-    """Eq. 3: networks of force and density, and Pi in both. What the paper leaves open is as in its public code."""
+    """Eq. 3: networks of force and density, and Pi in both equations. What the paper omits is as in its public code."""
     plain, network = {"window": "none", "scaling": "root"}, {"hidden": hidden}
     return {"pairs": {"basis": basis, **plain, **network},
             "eddy-viscosity": {"basis": basis, "form": "bounded", **plain},

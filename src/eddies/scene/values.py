@@ -51,7 +51,7 @@ class Section:
 
     Attributes
     ----------
-    _holder : field with the sections [section.NAME] by NAME; empty for a class without them.
+    _holder : name of the field that holds the sections [section.NAME] by NAME; empty for a class without them.
     """
 
     _holder: ClassVar[str] = ""
@@ -127,12 +127,15 @@ def text(about: str, default: Any = MISSING) -> Any:
 
 
 def texts(about: str, *words: str, default: Any = MISSING, paths: bool = False) -> Any:
-    """Declare a dataclass field that holds a tuple of strings: any, or only `words`, and import paths if `paths`."""
+    """Declare a dataclass field that holds a tuple of strings: any strings without `words`, else only `words`.
+
+    With `paths` import paths are allowed too.
+    """
     return _declare(Rule(str, about, words=words, paths=paths, many=True), default)
 
 
 def section(kind: type, default: Any = MISSING) -> Any:
-    """Declare a dataclass field that holds a section of the class `kind`; None: absent."""
+    """Declare a dataclass field that holds a section of the class `kind`, or None if the section is absent."""
     return dataclasses.field(default=default, metadata={"section": kind})
 
 
@@ -208,8 +211,8 @@ def _missing_key(kind: type[Section], field: dataclasses.Field, section: str) ->
 def write_section(section: Section, name: str = "", all_keys: bool = False) -> list[str]:
     """Return the lines `key = value  # meaning` of a section and of its own sections.
 
-    Absent keys and sections, and sections without keys, are left out. With `all_keys` comments list them. A section
-    inside another section does not repeat the lines of that section.
+    Absent keys and sections, and sections without keys, are left out. With `all_keys` comments list them. An inner
+    section does not repeat lines of the outer section.
     """
     lines, inner = [], []
     for field in dataclasses.fields(section):
@@ -257,7 +260,7 @@ def import_paths(part: Section) -> Iterator[tuple[str, str]]:
 
 
 def expanded(path: str) -> Path:
-    """Return a path with the home directory in place of `~`, unless that is unknown."""
+    """Return a path with the home directory in place of `~`, unless the home directory is unknown."""
     try:
         return Path(path).expanduser()
     except RuntimeError:  # no such user

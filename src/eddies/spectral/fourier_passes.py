@@ -91,7 +91,7 @@ class PlanePass:
         self._plans: dict[tuple[str, int, int], PlanePlans] = {}
 
     def blocks(self, count: int) -> list[slice]:
-        """Divide `count` planes into the blocks transformed together: even ones, and an odd last plane alone."""
+        """Divide `count` planes into blocks transformed together: of an even number, and an odd last plane alone."""
         size, even = 2 * max(1, threads() * BLOCK_BYTES // (self.cells**2 * self.dtype.itemsize)), count - count % 2
         blocks = [slice(start, min(start + size, even)) for start in range(0, even, size)]
         return blocks if even == count else [*blocks, slice(even, count)]
@@ -124,7 +124,7 @@ class PlanePass:
     def _planned(self, direction: str, fields: int, pairs: int) -> PlanePlans:
         n, K = self.cells, self.cutoff
         # Only the columns 0 ... K and -K ... -1 are transformed along y. Both ranges are widened to whole vectors where
-        # there is room: the rest of a vector costs as much as several whole ones.
+        # there is room: a partial vector costs as much as several whole ones.
         vector = 32 // self.dtype.itemsize
         stop, start = K + 1 + -(K + 1) % vector, n - K - (n - K) % vector
         if stop > start:
@@ -160,7 +160,7 @@ class PlanePass:
 
 
 def _gap(count: int, dtype: np.dtype) -> int:
-    """Return the padding after each line of `count` numbers with which transforms across lines do not crowd a cache."""
+    """Return the padding after each line of `count` numbers. It keeps transforms across lines from crowding a cache."""
     return 0 if count * dtype.itemsize % CROWDED else CACHE_LINE // dtype.itemsize
 
 

@@ -1,4 +1,4 @@
-"""Operators on the modes of fields, for numpy arrays and torch tensors; autograd differentiates those of tensors.
+"""Operators on the modes of fields, for numpy arrays and torch tensors; autograd differentiates them on tensors.
 
 Modes are (..., kz, ky, kx). Vectors have the order x, y, z, symmetric matrices xx, yy, zz, xy, xz, yz.
 """

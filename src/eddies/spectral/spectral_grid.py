@@ -23,7 +23,7 @@ Expansion = Callable[[np.ndarray], Sequence[Part]]
 
 
 class _Batch(NamedTuple):
-    """Transpose of a batch of components, and its blocks in the form that the copies of either side take."""
+    """Transpose of a batch of components, and its blocks in the forms that ColumnCopies and PlaneCopies take."""
 
     transpose: Transpose
     columns: Any
@@ -143,9 +143,9 @@ class SpectralGrid(ModeOperators):
         spectral : modes (c, kz, ky_local, kx).
         fields : number of fields yielded.
         expand : makes the modes of the fields, in parts (c_i, pairs, ky, kx), from packed modes in (ky, kx) of pairs of
-            planes. It gets those of `spectral` and of the z derivatives of its first `z_derivatives` components. It
-            may combine them and multiply by `d_dx` and `d_dy`. A part (d_dx, modes) is multiplied while it is copied.
-            By default the fields are the input of `expand`.
+            planes. It gets the packed modes of `spectral`, and of the z derivatives of the first `z_derivatives`
+            components. It may combine them and multiply by `d_dx` and `d_dy`. A part (d_dx, modes) is multiplied while
+            it is copied. By default the fields are the input of `expand`.
         """
         for planes, values in self._value_blocks(spectral, fields, expand, z_derivatives):
             yield values[..., ::2] if planes.stop - planes.start == 1 else values

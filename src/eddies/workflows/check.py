@@ -81,7 +81,7 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
 
 
 def cost(variant: str | None, stage: str, scenes: Sequence[Scene], ranks: int) -> dict[str, Any]:
-    """Cost of a stage for some scenes: wall time, memory and disk, on `ranks` ranks and on the most it can use."""
+    """Cost of a stage for some scenes: wall time, memory and disk, on `ranks` ranks and on as many as it can use."""
     most = min(min(most_ranks(each.ground_truth_alone if stage == "dns" else each).values()) for each in scenes)
 
     def total(values: Sequence[float | None]) -> float | None:

@@ -25,7 +25,7 @@ def run(one: Path, other: Path, comm: Comm) -> None:
 
 
 def diff_lines(one: Path, other: Path) -> list[str]:
-    """A table of the settings, defaults included, then one of the numbers with the ratio of the second to the first."""
+    """Lines of two tables: settings that differ (defaults included), and numbers that differ, with second / first."""
     runs = one, other
     settings = [dict(dotted(tomllib.loads(load_scene(path / "scene.toml").to_toml()))) for path in runs]
     lines = [*table("setting", settings, runs), ""]

@@ -49,7 +49,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
 
     The flow is first spun up ([spin_up]). The forcing ends at the release of the tracers, unless [tracers] forced is
     true. The run continues from the newest checkpoint with the same settings; only its duration may differ. Without
-    sets, the last state is kept as a checkpoint. The frames before it are then those of the product.
+    sets, the last state is kept as a checkpoint. The product then holds the frames before this state.
 
     Raises SceneError if the checkpoint is later than the end of the run, and Stopped, after a checkpoint, if `stop`
     requests it.

@@ -31,7 +31,7 @@ def run(run_directory: Path, output: Path, comm: Comm, layout: str = "vtkhdf") -
     """Write every series of a run directory; all ranks call it.
 
     With the layout "vtkhdf" a series is the file OUTPUT/PRODUCT-GROUP-NAME.vtkhdf, GROUP being fields or particles;
-    with "lagrangebench" one of particles is the directory OUTPUT/PRODUCT-particles-NAME.
+    with "lagrangebench" a series of particles is the directory OUTPUT/PRODUCT-particles-NAME.
 
     Raises:
         ProductError: on all ranks; there is no such series, a product is damaged, or a file cannot be written.
@@ -76,7 +76,7 @@ def _rollout(run_directory: Path, alone: Comm) -> Iterator[tuple[Series, Provena
 
 
 def _cube_of(series: Any) -> tuple[float, np.ndarray]:
-    """Edge and lower corner of the cube; for fields reconstructed from tracks, in the unit and frame of the tracks."""
+    """Edge and lower corner of the cube; for fields reconstructed from tracks, in the unit and axes of the tracks."""
     if isinstance(series, FieldSeries) and "about" in series.file:
         about = series.file["about"].attrs
         return BOX_LENGTH * float(about["length_unit"]), -about["corner"]

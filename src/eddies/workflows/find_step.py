@@ -8,8 +8,8 @@ be a fifth of e, or if d is less than 1e-3 of the velocity. A step must also con
 
 The steps of the first integrator are halved until one has converged. The search with each other integrator starts at
 the shortest step that needs no more evaluations than the best step so far. It doubles the step while the final velocity
-stays within the tolerance of the most accurate rollout with the best integrator. It ends at once if its shortest step
-is already farther away, because longer steps are less accurate.
+differs by at most the tolerance from that of the most accurate rollout with the best integrator. It ends at once if
+the shortest step already differs more, because longer steps are less accurate.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ TURNOVERS = 0.25  # duration of a short rollout in turnover times
 LARGEST_ERROR_SHARE, LEAST_TOLERANCE = 0.02, 1e-3
 # Largest number of halvings of a step.
 HALVINGS = 12
-# Another integrator replaces the best one if it needs less than this share of its time. Measured times vary.
+# Another integrator replaces the best one if it needs less than this share of that one's time. Measured times vary.
 CHEAPER = 0.9
 
 
@@ -66,6 +66,10 @@ class Stretch:
         self.truth, self.turnover = truth, float(truth.reference["eddy_turnover_time"])
         self.frame = min((frame for frame in truth.state_frames if frame > 0), default=1)
         most = (len(truth.times) - 1 - self.frame) // every
+        if most < 1:
+            raise SceneError(f"[simulation] frame_interval = {interval:g}: a ground truth ends at "
+                             f"{truth.times[-1]:.3g}, and the search for the step needs this interval after "
+                             f"{truth.times[self.frame]:.3g}; lower frame_interval, or raise [tracers] turnovers")
         count = min(max(round(TURNOVERS * self.turnover / interval), 1), most)
         self.stops = np.arange(1, count + 1) * interval
         self.end = truth.block(self.frame + count * every, ("velocity",))["velocity"]
@@ -140,7 +144,7 @@ class Ladder:
         return self[rung].distance(self.trials.get(rung - 1))
 
     def table(self) -> dict[str, list[float]]:
-        """The trials, the longest step first."""
+        """Columns of the table of trials, the longest step first."""
         trials = {rung: self.trials[rung] for rung in sorted(self.trials)}
         return {"size": [trial.step.size for trial in trials.values()],
                 "seconds_per_turnover": [trial.seconds for trial in trials.values()],
@@ -148,7 +152,7 @@ class Ladder:
                 "difference": [self.difference(rung) for rung in trials]}
 
     def converged(self, rung: int) -> bool:
-        """Whether a step has converged on all ground truths."""
+        """Whether the step of a rung has converged on all ground truths."""
         whole, half = self[rung], self[rung + 1]
         if not whole.distance(half) < half.tolerance:
             return False
@@ -174,7 +178,7 @@ def cheapest(ladders: Sequence[Ladder]) -> tuple[Ladder, int] | None:
 
 
 def cheaper(ladder: Ladder, best: Ladder, of_best: int) -> int | None:
-    """The rung of the longest converged step of a ladder that costs less than the best one so far, or None."""
+    """The rung of a ladder's longest converged step that costs less than the best so far; None if there is none."""
     most = best.evaluations / best.size(of_best)
     shortest = max((rung for rung in range(HALVINGS) if ladder.evaluations / ladder.size(rung) <= most), default=-1)
     most_seconds = CHEAPER * best[of_best].seconds

@@ -34,11 +34,11 @@ from eddies.workflows.variants import Step, steps
 
 LARGEST_MACH = 0.3           # turbulent Mach number; relative density fluctuations are about its square
 LEAST_REYNOLDS = 5.0         # Re_lambda above which large scales transfer energy to small ones
-KMAX_ETA = 1.0, 4.0          # the least that resolves the dissipation, and more than any purpose needs
+KMAX_ETA = 1.0, 4.0          # least value that resolves the dissipation; largest value that is useful
 MOST_STEPS = 10**9           # steps of a flow or rollout, or frames: a quarter of an hour at a microsecond each
 MOST_FORCED = 50             # how many times the energy of a flow the forcing may add in one step
 LOG_NEGLIGIBLE_ENERGY = -40.0  # logarithm of the share of the energy below which only round-off remains
-# Largest turnover time at the release of tracers over the expected one; the least Re_lambda for which it holds.
+# Largest ratio of the turnover time at the release of tracers to the expected one; least Re_lambda for this limit.
 LARGEST_TURNOVER_RATIO, TURBULENT = 3.0, 20.0
 
 
@@ -112,7 +112,7 @@ def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
 
 
 def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
-    """Yield problems: an unstable or decayed flow, too many steps, frames, ranks or bytes, too few frames."""
+    """Yield problems: an unstable or decayed flow, too many steps, frames, ranks or bytes, or too few frames."""
     scene, stages, expected = step.scene, step.stages, estimate(step.scene)
     tracers, turbulence = scene.tracers, expected.turbulence
     if "dns" in stages:
@@ -139,10 +139,10 @@ def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]
 
 
 def _strong_forcing(initial: Initial, forcing: Forcing, time: Time) -> Iterator[str]:
-    """A flow that the first step of the forcing makes unstable."""
+    """Yield a problem if the first step of the forcing makes the flow unstable."""
     if initial.flow.rms is not None:
         step = time.step or time.max_step  # a weak flow has a long step
-        unit = initial.flow.rms**2 / 2     # energy over the square of the amplitude
+        unit = initial.flow.rms**2 / 2     # energy divided by the square of the amplitude
         energy, gained = unit * initial.amplitude**2, forcing.injection_rate * step
         if gained > MOST_FORCED * energy:
             least = math.sqrt(gained / MOST_FORCED / unit)
@@ -152,7 +152,7 @@ def _strong_forcing(initial: Initial, forcing: Forcing, time: Time) -> Iterator[
 
 
 def _decay(flow: Flow, tracers: Tracers, turbulence: Turbulence) -> Iterator[str]:
-    """A flow that viscosity stops before the tracers end."""
+    """Yield a problem if viscosity stops the flow before the end of the tracer run."""
     time = tracers.turnovers * turbulence.turnover_time
     exponent = -2 * flow.viscosity * time  # of the largest modes, |k| = 1
     if exponent < LOG_NEGLIGIBLE_ENERGY and not tracers.forced:
@@ -175,13 +175,13 @@ def _too_many_frames(tracers: Tracers, span: float) -> Iterator[str]:
 
 
 def _too_many(key: str, value: float | str, step: float, span: float) -> Iterator[str]:
-    if not span <= MOST_STEPS * step:  # also where one is not a number
+    if not span <= MOST_STEPS * step:  # also if span or step is not a number
         yield (f"{key} = {value}: {span / step:.1e} steps of {step:.3g} for a time of {span:.3g}, more than the limit "
                f"of {MOST_STEPS:.0e}; raise this key, or lower the turnovers or the duration of the run")
 
 
 def _too_few_frames(tracers: Tracers, turnover_time: float, check: Callable[[int], None]) -> Iterator[str]:
-    """Too few frames for a `check` of their number, even with the longest possible turnover time."""
+    """Yield a problem if `check` finds too few frames even for the longest possible turnover time."""
     frames = max(math.ceil(LARGEST_TURNOVER_RATIO * tracers.turnovers * turnover_time / tracers.frame_interval), 1) + 1
     if frames <= MOST_STEPS:
         try:
@@ -191,7 +191,7 @@ def _too_few_frames(tracers: Tracers, turnover_time: float, check: Callable[[int
 
 
 def _large_files(needs: Mapping[str, Disk], ranks: int) -> Iterator[str]:
-    """Products that are too large for rank 0 to write for all."""
+    """Yield a problem for each product that is too large for rank 0 to write for all ranks."""
     for stage, needed in needs.items():
         if (size := (needed.kept or 0.0) - needed.other_files) > LARGEST_BYTES:
             yield (f"{STAGES[stage].file}: this h5py is built without MPI, so rank 0 writes for {ranks} ranks, at most "
@@ -248,7 +248,7 @@ def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str
 
 
 def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
-    """Warnings of the stages of a step; earlier steps write the files that are `made`."""
+    """Warnings of the stages of a step; `made` are the files that all steps write."""
     scene, stages, expected = step.scene, step.stages, estimate(step.scene)
     tracers, model, training, simulation = scene.tracers, scene.model, scene.own_training, scene.simulation
     if "dns" in stages and scene.tracks is None:
@@ -274,7 +274,7 @@ def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
 
 
 def resolution(flow: Flow, turbulence: Turbulence) -> Iterator[str]:
-    """A grid too coarse for the dissipation, or much finer than it needs."""
+    """Yield a warning if the grid is too coarse for the dissipation, or much finer than necessary."""
     k_max, (least, most) = flow.largest_wavenumber, KMAX_ETA
     reached = k_max * turbulence.kolmogorov_length
     cells = convenient(math.ceil(3 * least / turbulence.kolmogorov_length) + 1)
@@ -294,7 +294,7 @@ def convenient(cells: int) -> int:
 
 
 def compressibility(flow: Flow, speed: float | None) -> Iterator[str]:
-    """A sound speed too low for the flow."""
+    """Yield a warning if the sound speed is too low for the flow."""
     sound = flow.sound_speed
     if speed is None or sound is None or speed <= LARGEST_MACH * sound:
         return
@@ -305,7 +305,7 @@ def compressibility(flow: Flow, speed: float | None) -> Iterator[str]:
 
 
 def laminar_flow(flow: Flow, turbulence: Turbulence) -> Iterator[str]:
-    """A viscosity too high for turbulence."""
+    """Yield a warning if the viscosity is too high for turbulence."""
     reached = turbulence.reynolds_lambda
     if reached < LEAST_REYNOLDS:
         why = ("the flow is laminar" if reached < 1 else f"below {LEAST_REYNOLDS:g}, and eddies decay without making "
@@ -315,7 +315,7 @@ def laminar_flow(flow: Flow, turbulence: Turbulence) -> Iterator[str]:
 
 
 def stability(flow: Flow, time: Time, expected: Estimates) -> Iterator[str]:
-    """Steps of the direct simulation beyond the limits of its stepper."""
+    """Yield a warning for each limit of the stepper that the steps of the direct simulation exceed."""
     step = time.step or min(expected.courant_step or 0.0, time.max_step)
     for limit in limits_of_step(flow.largest_wavenumber, step, expected.peak_speed or 0.0, flow.viscosity,
                                 time.explicit, flow.sound_speed):
@@ -325,7 +325,7 @@ def stability(flow: Flow, time: Time, expected: Estimates) -> Iterator[str]:
 
 
 def filter_width(tracers: Tracers, flow: Flow, initial: Initial, forcing: Forcing | None) -> Iterator[str]:
-    """A filter narrower than a cell, or so wide that it removes the energy of the flow."""
+    """Yield a warning if the filter is narrower than a cell, or so wide that it removes the energy of the flow."""
     width, cell = tracers.filter_width, BOX_LENGTH / flow.cells
     if width < cell:
         yield (f"[tracers] filter_width = {width:.3g}: is narrower than a cell of the grid, so that nothing is "
@@ -339,7 +339,7 @@ def filter_width(tracers: Tracers, flow: Flow, initial: Initial, forcing: Forcin
 
 
 def untrained_terms(model: Model, training: Training) -> Iterator[str]:
-    """Terms that are not trained."""
+    """Yield a warning for each term whose parameters are not trained."""
     for name, settings in model.settings.items():
         if settings.learns_through_horizons and training.horizons is None:
             yield (f'[model] terms: "{name}" learns only in the training through horizons, and the scene has none, so '
@@ -347,7 +347,7 @@ def untrained_terms(model: Model, training: Training) -> Iterator[str]:
 
 
 def rollout_steps(settings: Simulation, allowed: float | None, model: Model, units: StepUnits) -> Iterator[str]:
-    """Steps of the particles that are longer than a forced flow or a term allows."""
+    """Yield warnings if steps of the particles are longer than a forced flow or a term allows."""
     if allowed and settings.longest_step > allowed * (1 + 1e-9):
         yield (f"[simulation] step = {settings.step:g}: is too long for the resolved velocity to follow the flow, so "
                f"the particles will take steps of about {at_most(allowed)}; lower step to {at_most(allowed)}")
@@ -359,7 +359,7 @@ def rollout_steps(settings: Simulation, allowed: float | None, model: Model, uni
 
 
 def beyond_truth(settings: Simulation, tracers: Tracers, seen: float) -> Iterator[str]:
-    """A rollout beyond the end of its ground truth. `seen` is the fraction that training has used.
+    """Yield a warning if a rollout ends after its ground truth. `seen` is the fraction that training has used.
 
     Later frames of a flow that is forced throughout are compared with the mean of the ground truth.
     """

@@ -101,7 +101,7 @@ class Source:
     ----------
     times : of the frames. spacing : mean distance of the particles. most : largest number of particles of a frame.
     truth : the ground truth with true fields; None for measured tracks.
-    unit : unit of length of the scene, in that of the tracks. corner : position of the tracks' origin in the cube.
+    unit : the scene's unit of length, in that of the tracks. corner : origin of the tracks in the cube, in that unit.
     """
 
     def __init__(self, scene: Scene, file: File, comm: Comm) -> None:
@@ -131,9 +131,9 @@ class ReconstructionRun:
 
     Parameters
     ----------
-    source : the particles. methods : the method for all particles; with a holdout also one for those that remain.
+    source : the particles. methods : a method for all particles; with a holdout, another for those kept.
     solver : solver on the grid of the modes. settings, tracers : [reconstruction] and [tracers].
-    viscosity, transfer : nu, and the transfer function G of the filter whose velocity the particles follow.
+    viscosity, transfer : nu, and the transfer function G of the filter of the particles' velocity.
     """
 
     def __init__(self, source: Source, methods: Sequence[Method], solver: ResolvedVelocity, settings: Reconstruction,
@@ -148,7 +148,7 @@ class ReconstructionRun:
 
     @property
     def steps(self) -> int:
-        """Number of frames so far."""
+        """Number of frames reconstructed so far."""
         return len(self.errors)
 
     @property

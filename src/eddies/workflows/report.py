@@ -60,7 +60,7 @@ SIMULATION = "dns_seconds_per_turnover"
 SOURCE_OF_TRACKS = ("{in_file} measured tracks from {file}, on average {mean_count:.0f} in a frame; {complete} are in "
                     "all frames. Fields are reconstructed from them by least squares. The dissipation rate is the "
                     "value of the literature for this velocity and integral scale.")
-MAIN_PAGE = 3  # the main page takes as long as this many other pages; so does a round of pages
+MAIN_PAGE = 3  # the main page takes as long as this number of other pages, and so does a round of pages
 Row = dict[str, Any]
 
 
@@ -68,8 +68,8 @@ Row = dict[str, Any]
 class Page:
     """A page of the report, made by one rank.
 
-    directory: run directory of the products. seconds: wall seconds by stage. provenance: by product. not_finite: a
-    sentence on each product with numbers that are not finite. images: figures as PNG files, by name.
+    directory: run directory of the products. seconds: wall seconds by stage. provenance: provenance by product.
+    not_finite: a sentence on each product with numbers that are not finite. images: figures as PNG files, by name.
     """
 
     directory: Path
@@ -158,7 +158,7 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: S
         output: Path | None = None) -> None:
     """Write report/index.html, report/figures/*.png and report/metrics.json of a run directory; all ranks call it.
 
-    With `output` they are written there instead, and those of variants in directories below it.
+    With `output` they are written there instead, and the reports of variants in directories below `output`.
     For a scene with variants the page begins with their table, followed by the details of one: the first of `variants`
     that was run, or the first of all. Each variant that was run also has a page of its own.
 
@@ -238,7 +238,7 @@ def _make(stored: Run, comm: Comm, alone: Comm, stop: StopRequest,
 def _makers(names: Sequence[str], ranks: int) -> tuple[dict[str, int], dict[str, int]]:
     """Return the rank that makes each page, and the round in which it does.
 
-    The main page, the first, takes about as long as three others. So does a round.
+    The first page is the main page. It takes about as long as three others, and so does a round.
     """
     makers, rounds, load = {}, {}, [0] * ranks
     for number, name in enumerate(names):
@@ -253,7 +253,7 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
     """Read the products of a run directory and return its page, with figures that are not drawn.
 
     scanned: results of the search for numbers that are not finite, by file; new results are added. The main page
-    shows everything. Others have fewer figures, and no sections on products that are links to other directories.
+    shows everything. Other pages have fewer figures, and no sections on products that are links to other directories.
     """
     page = Page(directory, read_stage_seconds(directory))
     readers = {
@@ -296,7 +296,7 @@ def _sections_or_notice(kind: str, page: Page, read: Callable[[], list[Section]]
     """Return the sections on a product, or one with a notice if numbers that are not finite make them impossible."""
     try:
         return read()
-    except (ValueError, OverflowError) as error:  # of a figure's limits, a PDF or a number of times
+    except (ValueError, OverflowError) as error:  # from the limits of a figure, a PDF or a number of times
         if not page.not_finite:
             raise
         title = kind.replace("_", " ").capitalize()

@@ -132,7 +132,7 @@ def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
 def stage_state(stage: Stage, directory: Path, settings: str, continued: str, text: str) -> str:
     """Describe in words the state of a stage in a directory.
 
-    `settings` is the fingerprint of the stage, `continued` that of the work it can continue, `text` the scene as TOML.
+    `settings` is the fingerprint of the stage, `continued` that of work that it can continue, `text` the scene as TOML.
     """
     product = directory / stage.file
     origin = product_provenance(product)

@@ -43,11 +43,11 @@ log = logging.getLogger("eddies")
 RUN = {"dns": dns.run, "train-kernel": train_kernel.run, "reconstruct": reconstruct.run, "train": train.run,
        "find-step": find_step.run, "simulate": simulate.run}
 FEW_STEPS = 4                # steps of a training, and intervals of a rollout
-LEAST_TURNOVERS = 1e-9       # turnovers of a spin-up or ground truth of as few steps as possible
+LEAST_TURNOVERS = 1e-9       # length of a spin-up or ground truth with as few steps as possible
 
 
 class StepTimes(StopRequest):
-    """Records the time of each call: stages ask before each step whether they must stop."""
+    """Records the time of each call. Stages call it before each step, to ask whether they must stop."""
 
     def __init__(self, comm: Comm, signals: Sequence[int]) -> None:
         super().__init__(comm, signals)
@@ -94,7 +94,7 @@ def run(scene: Scene, comm: Comm, signals: Sequence[int] = ()) -> None:
 
 
 def measured(name: str, measure: Callable[[], tuple[float, float, int | None]]) -> bool:
-    """Log the wall time of a stage, its seconds per step and its steps, as `measure` returns them; False if it fails.
+    """Log the wall time of a stage, its seconds per step and its steps, from `measure`. Returns False if that fails.
     If HDF5 could not write a file, the error is raised, because the job must then be aborted."""
     try:
         with quiet():
@@ -150,9 +150,9 @@ def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
 
 def rest_of_training(definition: ModelDefinition, few: Training, frames: int, directory: Path, device: torch.device,
                      stop: StopRequest) -> tuple[float, int, float]:
-    """Estimate what a training with one step on few frames lacks: further frames, and steps and validations of phases.
+    """Estimate the work that a training with one step on few frames omits: frames, and steps and validations of phases.
 
-    Returns the wall time of this, the number of steps, and the mean seconds of a step.
+    Returns the wall time of this work, the number of steps, and the mean seconds of a step.
     """
     comm, seconds, stepping, number = stop.comm, 0.0, 0.0, 0
     with open_truths(directory / STAGES["dns"].file, few.truth_files, definition.tracers, comm, device) as (

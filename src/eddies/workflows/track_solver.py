@@ -17,10 +17,10 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import WEIGHT, ResolvedVelocity
 
 WEIGHTS = 10.0 ** np.arange(3, -1.1, -0.5)  # weights of the noise in least squares; cross-validation chooses one
-RISE = 1.02             # of the validation error, at which the search ends
+RISE = 1.02             # the search ends when the error exceeds the least error by this factor
 HELD_OUT = 0.1          # share of the particles that cross-validation leaves out
 KNUTH = 2654435761      # spreads ids evenly over 32 bits
-NO_FILTER = 1e-3        # filter width over the spacing, for an unfiltered flow
+NO_FILTER = 1e-3        # filter width divided by the spacing, for an unfiltered flow
 
 
 def best_solver(particles: ParticleSet, make: Callable[[float], ResolvedVelocity],

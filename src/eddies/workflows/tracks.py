@@ -35,8 +35,8 @@ from eddies.workflows.track_solver import NO_FILTER, best_solver, particles_on, 
 
 log = logging.getLogger("eddies")
 
-LEAST_TRACKS = 8        # in all frames, that a model needs
-INTEGRAL_SCALE = 0.2    # of the edge of the box: a guess, for estimates before the run
+LEAST_TRACKS = 8        # least number of tracks in all frames that a model needs
+INTEGRAL_SCALE = 0.2    # integral scale divided by the edge of the box: a guess, for estimates before the run
 ROUNDS = 20             # iterations for the dissipation rate; each reduces the error to a third
 
 
@@ -119,8 +119,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     """Write ground_truth.h5 of measured tracks; all ranks call it.
 
     Its filtered fields are those of the resolved velocity, which regularised least squares find in the velocities of
-    the tracks. If the tracks follow the unfiltered flow, the filter is applied to it. The dissipation rate is the value
-    of the literature for the measured velocity and integral scale (`dissipation_constant`).
+    the tracks. If the tracks follow the unfiltered flow, the filter is applied to these fields. The dissipation rate is
+    the value of the literature for the measured velocity and integral scale (`dissipation_constant`).
     """
     tracers, tracks = scene.tracers, TrackFrames(comm, scene.tracks)
     complete, times = tracks.complete, tracks.times

@@ -114,7 +114,7 @@ def load_sample(truth: GroundTruth, index: int, support: float) -> KernelSample:
 
 def training_of(settings: Kernel, support: float, mean_volume: float | None, seed: int,
                 samples: list[KernelSample]) -> Training:
-    """The training of the kernel with the gradient loss, then without it.
+    """The training of two kernels: one with the gradient loss, then one without it.
 
     `mean_volume` is the mean volume of a particle, for a kernel that may be negative; None for a positive kernel.
     """

@@ -50,7 +50,7 @@ def row(scene: Scene, name: str, runs: Sequence[RolloutRun], realised: Sequence[
     """Return the row of a variant, or of a scene without variants, by COLUMNS; a missing number is None.
 
     realised: `numbers` of the rollouts in `runs`, or nothing if one of them is missing. Times are in turnovers T,
-    `wall_seconds` and `core_seconds` are those of one turnover.
+    and `wall_seconds` and `core_seconds` are per turnover.
     """
     variant = scene.variant.get(name, scene)
     found: dict[str, Any] = dict.fromkeys(COLUMNS)
@@ -99,8 +99,8 @@ def combined(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def simulation_seconds(scene: Scene, rows: Sequence[Mapping[str, Any]], of_truth: float | None) -> float | None:
-    """Return the wall seconds per turnover of the direct simulation: of the variant that repeats it, because it is
-    timed like the others, or else of the ground truth."""
+    """Return the wall seconds per turnover of the direct simulation: those of a variant on the same
+    grid, which is timed like the other variants, or else those of the ground truth."""
     repeated = [row["wall_seconds"] for row in rows if row["wall_seconds"] is not None
                 and (variant := scene.variant.get(row["name"], scene)).coarse_cells == variant.flow.cells]
     return min(repeated, default=of_truth)
@@ -171,7 +171,7 @@ def notes(scene: Scene) -> list[str]:
 
 
 def _measure_of(scene: Scene) -> Scene:
-    """Return the scene whose kernel measures all variants: that of the whole or, with sets of tracers, of the first."""
+    """Return the scene whose kernel measures all variants: the scene or, with sets of tracers, its first variant."""
     return next(iter(scene.variant.values())) if scene.sets else scene.without_variants
 
 

@@ -40,7 +40,7 @@ class Step:
     stages : the stages, in order. All make a product.
     directory : where they run.
     variant : name of the variant; None for what all variants share.
-    links : for products that are made elsewhere, the directory of each by stage.
+    links : the directory, by stage, of each product that is made elsewhere.
     """
 
     scene: Scene
@@ -113,7 +113,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
         making = tuple(stage for stage in stages if stage in MAKING)
         return [Step(scene, making, directory)] if making else []
     whole, seeds = scene.without_variants, scene.realisations or ()
-    # Directory of each ground truth that a variant may use, below that of the scene or of a realisation.
+    # Directory of each ground truth that a variant may use, relative to that of the scene or of a realisation.
     truths = ({fingerprint: path.parent for path, fingerprint in set_files(whole).items()}
               or {stage_fingerprint(whole, "dns"): Path()})
     realisations = tuple(directory / f"{REALISATION}{seed}" for seed in seeds)

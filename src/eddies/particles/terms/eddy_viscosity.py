@@ -17,12 +17,12 @@ from eddies.scene import terms as declared
 
 # Softens quotients at small distances, in squared units of the filter width.
 SOFTENING = 0.1
-# In the order of their numbers in the compiled library.
+# Forms of Pi, in the order of their numbers in the compiled library.
 FORMS = "two-sided", "monaghan", "bounded"
 
 
 class EddyViscosity(PairTerm):
-    """a_rms times the sum of w Pi b_1, with weights and scaling as in the pair network, and
+    """dv_i/dt is a_rms times the scaled sum of w Pi b_1, with window, direction and scaling as in PairNetwork, and
 
         Pi = -|a_1| mu + |a_2| mu^2,   mu = x.v / (|x|^2 + 0.1),
 

@@ -24,14 +24,14 @@ class FilteredEquations(Term):
     is learned. It is near 1, the value of the gradient model (Leonard 1975; Clark et al. 1979), whose force is
     -f (d^2/12) d_j d_k u_i d_k u_j.
 
-    p/rho_0 starts from the particles' own density, c^2 (rho/rho_0 - 1). `sweeps` steps of Chebyshev's iteration then
-    reduce the residual
+    p, the pressure divided by rho_0, starts from c^2 (rho/rho_0 - 1) with the particles' own density. `sweeps` steps of
+    Chebyshev's iteration then reduce the residual
 
         (laplacian p + s)_i / sum_j |w_ij|,   s = d_i u_j d_j u_i + div div tau - C_d (2 u'/d) div u,
 
-    w_ij the weights of the Laplacian, and the density follows the pressure,
+    with the weights w_ij of the Laplacian. The density follows the pressure,
 
-        d rho/dt = C_p (2 u'/d) (rho_0/c^2) (p - p before).
+        d rho/dt = C_p (2 u'/d) (rho_0/c^2) (p - p before the sweeps).
 
     So pressure spreads from neighbour to neighbour, sweep by sweep, and no sound has to be resolved. Forces, p and s
     are taken relative to their means over all particles.

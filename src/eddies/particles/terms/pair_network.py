@@ -41,10 +41,10 @@ def scaled(sums: Tensor, settings: PairSum, context: Context) -> Tensor:
 
 
 def along_separation(sums: Tensor, settings: ForceSum, context: Context) -> Tensor:
-    """Sums sum_j w f b_1 (3, k), scaled.
+    """Sums sum_j w f b_1 (3, k) with any factor f of the pairs, scaled.
 
-    In the basis "corrected" the factor is the inverse of M_i = sum_j w x x^T instead: differences between irregular
-    particles then give a derivative.
+    In the basis "corrected" the sums are multiplied by the inverse of M_i = sum_j w x x^T instead: differences between
+    irregular particles then give a derivative.
     """
     if settings.basis == "corrected":
         return moments.apply_symmetric(context.moments.inverse, sums)
@@ -121,7 +121,7 @@ class PairNetwork(PairTerm):
     NN_1 and NN_2 are functions of the invariants of a pair (rho'_i, rho'_j, |x|, |v|, x.v) in the units of
     `ScaledPairs`. w is the window, s the scaling and M_i = sum_j w x x^T. With symmetry "antisymmetric" the first two
     invariants are rho'_i + rho'_j and (rho'_i - rho'_j)^2: the forces of a pair are opposite and conserve the total
-    momentum. Without the densities the sums are opposite too. Opposite sums evaluate each pair once.
+    momentum. They are also opposite if the densities are no inputs. In both cases each pair is evaluated once.
     """
 
     Settings = declared.PairNetwork

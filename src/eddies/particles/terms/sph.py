@@ -38,7 +38,7 @@ class _SPHTerm(PairTerm):
         return self.mass * over_distance(self.kernel.derivative(listed.distance), listed.distance)
 
     def densities(self, pairs: ScaledPairs) -> tuple[Tensor, Tensor]:
-        """rho_i and rho_j of each pair, (m,)."""
+        """rho_i and rho_j of each pair, (pairs,)."""
         density = pairs.column("density").to(pairs.pairs.distance)
         return pairs.pairs.at_receivers(density), pairs.pairs.at_senders(density)
 
@@ -173,7 +173,7 @@ class TransportVelocity(_SPHTerm):
                                "acts; learned in units of rho_0 c h", "M/(L T)", self.unit)]
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
-        """-m (1/rho_i^2 + 1/rho_j^2) grad W, and the entries of -m (v_i - v_j) grad W^T/(rho_i rho_j): (12, m)."""
+        """-m (1/rho_i^2 + 1/rho_j^2) grad W, and the entries of -m (v_i - v_j) grad W^T/(rho_i rho_j); (12, pairs)."""
         listed, (own, other) = pairs.pairs, self.densities(pairs)
         slope = self.slope(listed) * listed.displacement.T
         gradient = pairs.velocity_difference[:, None] * (slope / (own * other))

@@ -64,7 +64,7 @@ class PairTerm(Term, PairSum):
     """A term that is a sum over pairs; see PairSum.
 
     The sums of several such terms are taken together over the same pairs. If terms give a density that others read,
-    there are two such passes. The rates are those of the requested particles; in training these are some of the owned.
+    there are two such passes. Rates are computed for the requested particles; in training, for some of the owned ones.
     """
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:

@@ -9,7 +9,7 @@ from eddies.scene.scene import BOX_LENGTH, Flow, Forcing, Initial, Scene, Simula
 from eddies.scene.sections import METHODS
 
 DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
-PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) over u' in turbulence: at most four rms in each component
+PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) divided by u' in turbulence; a component is at most four rms
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Estimates:
     Parameters
     ----------
     turbulence : sustained by the forcing, or decaying from a random start; None for other flows.
-    peak_speed : maximum of |u| + |v| + |w|; None for a flow from a file or of the user, without forcing.
+    peak_speed : maximum of |u| + |v| + |w|; None without forcing, if the flow is from a file or of the user.
     rms_speed : rms of the velocity vector; None where `peak_speed` is None, and for a pure sound wave.
     mach : turbulent Mach number; None without sound.
     courant_step : longest step of the direct simulation that its Courant number allows.
@@ -69,9 +69,9 @@ class Estimates:
     frame_intervals : number of frame intervals of the tracers, 0 without tracers.
     steps : number of steps of the direct simulation.
     resolved_shells : largest wavenumber along each axis of the resolved velocity of particles; 0 without tracers.
-    allowed_step : longest step of particles with a resolved velocity, at the speed at which the tracers start.
+    allowed_step : longest step of particles with a resolved velocity, for the expected rms velocity.
     rollout_step : longest step of the rollout.
-    rollout : None also without a rollout, and for a method of the user.
+    rollout : numbers of the rollout; None also if the scene has no rollout, and for a method of the user.
     """
 
     turbulence: Turbulence | None
@@ -155,7 +155,7 @@ def expected_turbulence(flow: Flow, initial: Initial, forcing: Forcing | None) -
 
 
 def peak_speed(flow: Flow, initial: Initial, turbulence: Turbulence | None) -> float | None:
-    """Expected maximum of |u| + |v| + |w|; None for a flow from a file or of the user, without forcing."""
+    """Expected maximum of |u| + |v| + |w|; None without forcing, if the flow is from a file or of the user."""
     if turbulence or initial.flow.turbulent:
         return PEAK_SPEED * (turbulence.velocity_rms if turbulence else initial.amplitude)
     if initial.flow.sound:

@@ -11,14 +11,14 @@ from eddies.scene.scene import BOX_LENGTH, Horizons, Scene, Tracers
 from eddies.scene.sections import NEIGHBORS
 from eddies.workflows.foreseen.numbers import expected_turbulence
 
-PEAK_VELOCITY = 4.0          # largest component of the velocity of a particle over u'
+PEAK_VELOCITY = 4.0          # largest component of the velocity of a particle, divided by u'
 ALLOWED_VELOCITY = 6.0       # the same in the training through horizons, whose ghost planes allow for it
 GHOST_PLANES = {"cubic": 3, "quintic": 4}
 RESOLVED = "ghost planes of the resolved velocity"
 
 
 def most_ranks(scene: Scene) -> dict[str, int]:
-    """The largest number of ranks for each limit. A limit of a variant is given if it is stricter than the scene's."""
+    """The largest number of ranks for each limit. A variant's limit is given if it is below the scene's."""
     limits, tracers, simulation = {"a grid plane for each rank": scene.flow.cells}, scene.tracers, scene.simulation
     skin = simulation.skin * scene.interaction_radius if simulation else 0.0
     trains = "train" in scene.stages
@@ -108,7 +108,7 @@ def rank_problems(limits: Mapping[str, int], ranks: int) -> Iterator[str]:
 
 
 def reach_limit(tracers: Tracers, reach: float, when: str = "") -> dict[str, int]:
-    """The limit from the distance `reach` over which particles act on each other; `when` ends its name."""
+    """The limit from the distance `reach` over which particles act on each other; `when` is appended to its name."""
     return {f"slabs no thinner than the particles' reach {reach:.3g}{when}": thick_slabs(tracers.planes, reach)}
 
 

@@ -16,20 +16,20 @@ from eddies.time_stepping import ETDRK4, STEPPERS
 from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_FRAMES
 
-# Measured seconds on one and two cores of an AMD EPYC with AVX-512 (`tiny`, `hit-small`, `hit-coarse`). TRANSFORM: of
-# a grid point, times 1 + cells / CACHED in the direct simulation, whose planes outgrow the caches. PAIR: of a pair of
-# particles. TRACER: pairs that take as long as a step of a tracer. SINGLE: a point in single precision over one in
-# double. WEIGHT: of a weight of a network, for each pair. CALL: overhead of an evaluation or iteration. MESSAGE: of
-# a message; a call has ROUNDS of them for each further rank. START: overhead of a stage.
+# Measured seconds on one and two cores of an AMD EPYC with AVX-512 (`tiny`, `hit-small`, `hit-coarse`). TRANSFORM: a
+# transform, for each grid point, times 1 + cells / CACHED in the direct simulation, whose planes outgrow the caches.
+# PAIR: a pair of particles. WEIGHT: a weight of a network, for each pair. CALL: overhead of an evaluation or iteration.
+# MESSAGE: a message; a call has ROUNDS of them for each further rank. START: overhead of a stage. The others are not
+# seconds. TRACER: pairs that cost as much as a step of a tracer. SINGLE: cost in single over double precision.
 TRANSFORM, CACHED, SINGLE, PAIR, TRACER, WEIGHT = 4e-9, 550, 0.65, 2.5e-8, 200, 6e-11
 CALL, MESSAGE, ROUNDS = 2.5e-4, 2e-6, 4
 START = {"dns": 0.4, "train-kernel": 0.7, "reconstruct": 1.0, "train": 1.0, "find-step": 0.5, "simulate": 0.3,
          "report": 2.3}
-DERIVATIVES = 3              # cost of a neighbour in kriging of all derivatives at particles, in averages
-FORM_PAIRS = {"average": 1, "linear": 1.5, "quadratic": 2.5, "kriging": 6}  # cost of a neighbour, in averages
-SEARCH, CONFIRM = 2, 0.75    # turnovers of the rollouts of a search, and of those on each further ground truth
-COLD, ITERATION = 25, 12     # iterations of a solve without a first guess; transforms of a point in each
-GRADIENT = 4                 # an evaluation with its gradient, over an evaluation
+DERIVATIVES = 3              # cost of a neighbour in kriging of all derivatives at particles, relative to averages
+FORM_PAIRS = {"average": 1, "linear": 1.5, "quadratic": 2.5, "kriging": 6}  # cost of a neighbour relative to averages
+SEARCH, CONFIRM = 2, 0.75    # turnovers that a search simulates on the first ground truth, and on each further one
+COLD, ITERATION = 25, 12     # iterations of a solve without a first guess; transforms in each iteration
+GRADIENT = 4                 # cost of an evaluation with its gradient, relative to one without
 
 
 def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
@@ -50,7 +50,7 @@ def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
             followed = tracers.turnovers / (tracers.turnovers + (scene.spin_up.turnovers if scene.spin_up else 0.0))
             particles = sum(each.particles for each in (tracers.sets.values() if tracers.sets else [tracers]))
             pairs = expected.steps * followed * particles * TRACER
-    elif stage == "train-kernel":  # twice
+    elif stage == "train-kernel":  # two kernels are trained
         calls = 2 * kernel.steps * GRADIENT
         pairs = kernel.neighbors * (kernel.steps * tracers.particles + 2 * KERNEL_FIELDS * tracers.cells**3)
     elif stage == "reconstruct":
@@ -99,4 +99,4 @@ def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
     whole += calls * (CALL + ROUNDS * (ranks - 1) * MESSAGE)
     if stage == "find-step":
         whole *= (SEARCH + CONFIRM * len(scene.simulation.confirming_files)) / scene.simulation.turnovers
-    return START[stage] / (ranks if stage == "report" else 1) + whole  # pages are shared out
+    return START[stage] / (ranks if stage == "report" else 1) + whole  # ranks share the pages

@@ -21,15 +21,15 @@ FLOW_PROCESS, TORCH_PROCESS, REPORT_PROCESS = 100e6, 285e6, 280e6
 # Direct simulation, by whether the fluid is compressible: bytes of a cell in float64, and number of work arrays of two
 # planes. Bytes of a tracer.
 CELL_BYTES, BLOCK_ARRAYS, TRACER_BYTES = {True: 320, False: 220}, {True: 64, False: 32}, 300
-# Evaluation of a model: a particle, a point of its grid, a listed neighbour. Training of the kernel: a neighbour of a
-# grid point, a particle in the table of a field.
+# Bytes in the evaluation of a model: of a particle, a point of its grid, a listed neighbour. Bytes in the training of
+# the kernel: of a neighbour of a grid point, a particle in the table of a field.
 PARTICLE_BYTES, POINT_BYTES, NEIGHBOR_BYTES, GRADIENT_BYTES, TABLE_BYTES = 800, 160, 8, 200, 1100
-# Disk: a product without its frames, a report, a row of the statistics without the spectrum.
+# Bytes on disk: of a product without its frames, a report, a row of the statistics without the spectrum.
 PRODUCT_BYTES, REPORT_BYTES, SAMPLE_BYTES = 45_000, 10e6, 200
 
 
 def memory(scene: Scene, stage: str, ranks: int) -> float:
-    """Memory of the rank that needs most."""
+    """Memory of the rank that needs most in a stage."""
     if stage in ("dns", "report"):
         return flow_memory(scene.flow, scene.tracers, ranks) if stage == "dns" else REPORT_PROCESS
     tracers, kernel = scene.tracers, scene.kernel
@@ -78,7 +78,7 @@ def disk(scene: Scene, stage: str) -> Disk:
         k_max, intervals = flow.largest_wavenumber, expected.frame_intervals
         statistics = (SAMPLE_BYTES + 8 * (math.ceil(math.sqrt(3) * k_max) + 1)) * ((expected.steps or 0) // EVERY)
         state = flow.components * (2 * k_max + 1) ** 2 * (k_max + 1) * 2 * flow.real_bytes
-        checkpoints = KEPT * state    # KEPT + 1 while one is written; one stays, in `state`
+        checkpoints = KEPT * state    # KEPT + 1 while one is written; `state` counts the one that stays
         if tracers is None:
             return Disk(state + statistics + 4 * flow.components * flow.cells**3, checkpoints, state)
         during, after = (
@@ -114,8 +114,8 @@ def most_disk(work: Iterable[Disk]) -> float:
 
 
 def trajectory_bytes(flow: Flow, tracers: Tracers, frames: int, whole: int) -> int:
-    """Size of frames of tracers (position, velocity, images of the box and density), of filtered fields, and of a
-    number of `whole` states."""
+    """Size of frames of tracers (position, velocity, images of the box and density), of filtered fields, and of the
+    unfiltered states, whose number is `whole`."""
     size = 0
     for each in tracers.all:
         points = (each.cells**3 * math.ceil(frames / each.field_every)

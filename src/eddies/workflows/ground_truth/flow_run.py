@@ -171,7 +171,7 @@ class TracerRun:
     flow : its forcing ends at the release unless [tracers] forced is true.
     segments : the files for the frames.
     settings, seed : [tracers], and the seed of random places.
-    whole : takes the number of frames; returns those, all with filtered fields, that store the unfiltered flow.
+    whole : for a number of frames, returns the frames that store the unfiltered flow. All have filtered fields.
     saved : the checkpoint, or None.
     """
 

@@ -13,7 +13,7 @@ from eddies.scene.scene import SceneError, Simulation, Tracers, Training
 
 HELD_OUT = 0.1               # share of the training window, at its end, for validation; at least the longest horizon
 KERNEL_FIELDS = 4            # filtered fields that the kernel is trained on
-TESTED_FRAMES, TESTED_PARTICLES = 9, 20_000  # of the a-priori test, which stores the rates of the particles
+TESTED_FRAMES, TESTED_PARTICLES = 9, 20_000  # of the a-priori test; it stores the rates of these particles
 
 
 def check_frames(stages: Sequence[str], tracers: Tracers, training: Training | None, simulation: Simulation | None,

@@ -25,7 +25,7 @@ from eddies.spectral.spectral_grid import SpectralGrid, regrid
 
 log = logging.getLogger("eddies")
 
-MOST_REMOVED = 0.05  # of the energy of another code's flow, in a part with divergence; more gives a warning
+MOST_REMOVED = 0.05  # largest share of energy in the divergent part of another code's flow; more gives a warning
 
 
 def build_fluid(flow: Flow, forcing: Forcing | None, comm: Comm) -> Fluid:
@@ -124,7 +124,7 @@ def _state_from_file(initial: Initial, fluid: Fluid) -> np.ndarray:
                          "multiplied by %.3g to keep the pressure", stored_speed,
                          (stored_speed / fluid.sound_speed) ** 2)
         return np.concatenate([velocity, density])
-    # The velocity of a compressible flow, in single precision or on fewer points, is not exactly solenoidal.
+    # A velocity from a compressible flow, from single precision or from fewer points is not exactly solenoidal.
     solenoidal = grid.solenoidal(velocity)
     if foreign:
         kept, all_of_it = (grid.sum_modes(np.square(np.abs(part)).sum(axis=0)) for part in (solenoidal, velocity))

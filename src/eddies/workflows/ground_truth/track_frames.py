@@ -17,8 +17,8 @@ from eddies.parallel.slab import block_starts
 from eddies.scene.scene import BOX_LENGTH, SceneError
 from eddies.scene.sections import Tracks as Settings
 
-UNEQUAL = 0.01    # largest deviation of a time from equal intervals, over the interval
-SAME = 1e-3       # part of the longest interval below which two times are the same frame
+UNEQUAL = 0.01    # largest deviation of a time from equal intervals, divided by the interval
+SAME = 1e-3       # fraction of the longest interval below which two times are the same frame
 LEAST_FRAMES = 3
 MARGIN = 4.0      # spacings between a volume and its periodic image
 
@@ -30,10 +30,10 @@ class MeasuredTracks:
     Parameters
     ----------
     times : from 0 on, (frames,). starts : first row of each frame, and the number of rows, (frames + 1,).
-    columns : id (rows,), position and velocity (rows, 3), and density (rows,) over its mean, if it was asked for.
+    columns : id (rows,), position and velocity (rows, 3), and, if asked for, density / mean density (rows,).
     throughout : whether the track of a row is there in all frames, (rows,).
     spacing : mean distance of the particles of a frame, in the volume in which they are.
-    unit : unit of length, in that of the file. corner : position of the file's origin in the cube, in that unit.
+    unit : the scene's unit of length, in the file's unit. corner : the file's origin in the cube, in the file's unit.
     about : the attributes of the product that describe the file and the tracks.
     """
 
@@ -61,7 +61,7 @@ class MeasuredTracks:
         return int(self.throughout[:self.starts[1]].sum())
 
     def frame(self, number: int, complete: bool = False) -> dict[str, np.ndarray]:
-        """The rows of a frame; `complete`: those of tracks that are there in all frames, with ids 0, 1, ..."""
+        """The rows of a frame. With `complete` only tracks that are there in all frames, with new ids 0, 1, ..."""
         rows = np.arange(*self.starts[number:number + 2])
         if not complete:
             return {name: values[rows] for name, values in self.columns.items()}

@@ -35,7 +35,7 @@ class GroundTruth:
         self.trajectory, self.fields = Trajectory(file, "tracers"), FieldSeries(file, "filtered")
         self.times, self.total = self.trajectory.times, self.trajectory.total
         self.reference = read_attributes(file, "reference")
-        #: the forcing after the release of the tracers, None without one
+        #: the forcing after the release of the tracers, None if there is none
         self.forcing = Forcing(**read_attributes(file, "forcing")) if "forcing" in file else None
         self.has_density = "density" in self.trajectory.columns
         self._evolving = ("velocity", "density") if self.has_density else ("velocity",)
@@ -47,7 +47,7 @@ class GroundTruth:
 
     @property
     def scales(self) -> ReferenceScales:
-        """Reference scales of the flow at the release of the tracers. Those of a density are None without a density."""
+        """Reference scales of the flow at the release of the tracers. Scales of a missing density are None."""
         r = self.reference
         density = ({"density": r["density_rms"], "density_rate": r["density_rate_rms"],
                     "sound_speed": r["sound_speed"]} if self.has_density else {})
@@ -84,7 +84,7 @@ class GroundTruth:
         return migrate(self.decomposition, columns)
 
     def planes(self, series: FieldSeries, index: int, variable: str, slab: SlabDecomposition) -> np.ndarray:
-        """The planes of a slab of one of `fields` or `states`, (components, z_local, y, x), in double precision."""
+        """The planes of a slab, from `fields` or `states`, in double precision: (components, z_local, y, x)."""
         return self._together(lambda: series.read(index, variable, slab.start, slab.stop)).astype(np.float64)
 
     @cached_property
@@ -98,7 +98,7 @@ class GroundTruth:
         return [] if "tracks" in self._file else self._frames_of(self.states)
 
     def field_at(self, frame: int, points: torch.Tensor) -> np.ndarray:
-        """The stored filtered velocity (m, 3) at the time of a frame, at the `grid_points` (m, 3) of this rank."""
+        """The stored filtered velocity (m, 3) at the time of a frame, at the grid points (m, 3) of this rank."""
         cells, index = self.fields.cells, self.field_frames.index(frame)
         planes = len(points) // cells**2
         first = round(float(points[0, 2]) * cells / self.decomposition.length) if planes else 0
@@ -116,5 +116,5 @@ class GroundTruth:
         return [int(np.argmin(np.abs(self.times - time))) for time in series.times]
 
     def _together(self, read: Callable[[], Result]) -> Result:
-        """Read on this rank; all ranks raise the ProductError of one."""
+        """Read on this rank. If one rank raises ProductError, all ranks raise it."""
         return on_all_ranks(self.decomposition.comm, read, ProductError)

@@ -35,7 +35,7 @@ def evaluation_frames(truth: GroundTruth) -> np.ndarray:
 @torch.no_grad()
 def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, last_seen: int,
              dtype: torch.dtype) -> dict[str, dict[str, np.ndarray]]:
-    """Normalised L2 errors over the delay since `last_seen`, and samples of rates at the last frame; collective.
+    """Normalised L2 errors by the delay since frame `last_seen`, and samples of rates at the last frame; collective.
 
     `acceleration_error`: the model as in a rollout, with the density that its terms give.
     `true_density_acceleration_error`: the model with the true density.

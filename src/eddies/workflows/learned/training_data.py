@@ -32,10 +32,10 @@ log = logging.getLogger("eddies")
 
 
 class TrainingData:
-    """A model in the units of a ground truth, with the frames and windows of it for training and validation.
+    """A model in the units of a ground truth, and that ground truth's frames and windows for training and validation.
 
-    `last` is the last frame of the training window. `learned` is the last frame that is trained on; the frames between
-    the two are for validation.
+    `last` is the last frame of the training window. `learned` is the last frame that is trained on; later frames
+    up to `last` are for validation.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class TrainingData:
         if resolution is None and settings.energy_weight > 0:
             resolution = ResolvedVelocity.on_slabs(slab, self.model.flow.scales, drift, self.dtype)
         if resolution is not None:
-            # Gradients are with respect to the particles alone, so an extrapolated start may not affect the result.
+            # Gradients are with respect to the particles alone, so an extrapolated start must not affect the result.
             resolution.tolerance_predicted = resolution.tolerance
         starts = evenly(self.learned - self.longest + 1, self.count)
         windows = [self._window(start, resolution) for start in starts]

@@ -1,4 +1,4 @@
-"""Use of a trained model on another flow: the weights of the source with the scales of this flow."""
+"""Use of a trained model on another flow: the weights of another run with the scales of this flow."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def run(scene: Scene, comm: Comm, directory: Path) -> None:
 def trained_on(source: ModelSource, path: str) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:
     """The run in which the weights of a source were trained, and the a-priori errors on the flow of that run.
 
-    The run is `path`, with its Mach number, unless the source itself took its weights from another run. If it was
-    trained on ground truths of other runs only, these are `truths` with their Mach numbers, and the errors are None.
+    The run is `path`, with its Mach number, unless the source itself took its weights from another run. If the
+    source was trained only on ground truths of other runs, `truths` has their Mach numbers, and the errors are None.
     """
     origin = source.provenance
     if "source" in origin:

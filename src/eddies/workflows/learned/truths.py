@@ -37,7 +37,7 @@ def open_truths(own_file: Path, named: Sequence[Path], tracers: Tracers, comm: C
 
 def truth_problems(settings: Training, tracers: Tracers, reads: Collection[str], own_file: Path,
                    comm: Comm) -> list[str]:
-    """Reasons why [training] truths cannot be used with terms that read `reads`, one line each; all ranks call it.
+    """Reasons why [training] truths cannot be used with terms of the inputs `reads`, one line each; all ranks call it.
 
     The ground truth of the run itself, `own_file`, is not examined, because it may not exist yet.
     """
@@ -66,7 +66,7 @@ def _truth_in(file: File, tracers: Tracers, comm: Comm,
 
 def _problems_of(file: File, settings: Training, tracers: Tracers, reads: Collection[str],
                  comm: Comm) -> Iterator[str]:
-    """Reasons why an open ground truth of another run does not fit [training], [tracers] and terms that `reads`."""
+    """Reasons why an open ground truth of another run does not fit [training], [tracers] and the inputs `reads`."""
     if "particles/tracers" not in file:
         yield "holds no tracers to learn from; give the run of a scene with [tracers]"
         return

@@ -41,9 +41,9 @@ RUNAWAY_ENERGY = 100.0
 class EulerianRun:
     """A fluid on a coarse grid, with or without a closure, that starts at a frame of the truth.
 
-    It starts from the modes of the unfiltered velocity that the grid holds: of the true flow, or those found from the
-    velocities of the particles. Equations for the filtered velocity start from these modes after the filter. The
-    particles follow the filtered velocity in both cases.
+    It starts from the modes of the unfiltered velocity that the grid holds. They are those of the true flow, or are
+    found from the velocities of the particles. Equations for the filtered velocity start from these modes after the
+    filter. The particles always follow the filtered velocity.
     """
 
     def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:
@@ -51,7 +51,7 @@ class EulerianRun:
         comm, length, width = truth.decomposition.comm, truth.decomposition.length, truth.scales.filter_width
         cells = self.settings.cells_for(width)
         grid = SpectralGrid(SlabDecomposition(comm, length, cells), scene.simulation.precision)
-        # Width of the filter that the velocity of the fluid has passed, and of the filter for the particles.
+        # Widths of two filters: one that the fluid's velocity has passed, and one still to apply for the particles.
         filter_passed = self.settings.filter_passed(width)
         filter_left = 0.0 if filter_passed else width
         forcing = None
@@ -184,8 +184,8 @@ def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float, dire
 def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame: int) -> np.ndarray:
     """The modes of the true flow at a frame, on the grid of a fluid. The velocity is filtered with `filter_passed`.
 
-    The density is read from the frame, or is in balance with a filtered velocity. Raises SceneError if the unfiltered
-    flow is not stored at that frame.
+    The density is read from the frame; a filtered velocity gets a density in balance with it. Raises SceneError if the
+    unfiltered flow is not stored at that frame.
     """
     grid, series = fluid.grid, truth.states
     if frame not in truth.state_frames:
@@ -214,8 +214,9 @@ def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame:
 
 @torch.no_grad()
 def state_of_particles(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame: int) -> np.ndarray:
-    """The modes that least squares find in the velocities of the true particles at a frame (`ResolvedVelocity`). Their
-    filter is undone, unless the equations are for the filtered velocity. A density is in balance with the velocity.
+    """The modes that least squares find in the velocities of the true particles at a frame (`ResolvedVelocity`). The
+    filter of the particles is undone, unless the equations are for the filtered velocity. A density is in balance with
+    the velocity.
 
     Modes beyond those that the particles resolve are zero.
     """

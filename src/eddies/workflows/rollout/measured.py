@@ -27,7 +27,7 @@ from eddies.workflows.rollout.particle_measures import (GRADIENT, FieldsOfPartic
 
 log = logging.getLogger("eddies")
 
-Task = tuple[str, str, int]  # "spectra", "invariants" or "planes", "model" or "truth", frame
+Task = tuple[str, str, int]  # quantity ("spectra", "invariants" or "planes"), "model" or "truth", frame
 #: Measures of true tracers by ground truth, kernel, quantity and frame. The rank that measured one holds its value, the
 #: others hold None.
 TruthMeasures = dict[tuple[Path, Path | None, str, int], Any]
@@ -40,8 +40,9 @@ class TrueParticles:
 
     Parameters
     ----------
-    tracers : of the ground truth.
-    start_time : of the rollout. times : of its frames, (m,). Frames that the tracers do not have are left out.
+    tracers : the tracers of the ground truth.
+    start_time : start of the rollout. times : times of its frames since then, (m,). Times without a frame of
+        the tracers are left out.
     """
 
     def __init__(self, tracers: Trajectory, start_time: float, times: np.ndarray) -> None:
@@ -104,9 +105,9 @@ class MeasuredRollout:
 
     Parameters
     ----------
-    rollout : the rollout and its truth. provenance : of its product.
+    rollout : the rollout and its truth. provenance : provenance of rollout.h5.
     directory : the run directory.
-    fields : reconstructs fields of particles; None without a kernel or a ground truth.
+    fields : reconstructs fields of particles; None if the kernel or the ground truth is missing.
     solver : makes spectra of particles; None without a ground truth.
     stationary : whether the ground truth has a stationary state.
     """
@@ -207,7 +208,7 @@ class MeasuredRollout:
         return list(dict.fromkeys(tasks))
 
     def _key(self, task: Task) -> Any:
-        """Return the key of a measure in TruthMeasures. For the model it is the task, which is never such a key."""
+        """Return the key of a measure in TruthMeasures. For a measure of the model it is the task itself."""
         quantity, of, frame = task
         if of == "model":
             return task

@@ -27,8 +27,8 @@ class FieldsOfParticles:
 
     Parameters
     ----------
-    form : of the reconstruction. slab : of one rank, with a plane for each cell of the grid. Grid point i is at
-        i L / cells.
+    form : the form of reconstruction. slab : the box on one rank, with as many planes as the grid has cells along a
+        side. Grid point i is at i L / cells.
     """
 
     def __init__(self, form: Form, slab: SlabDecomposition) -> None:
@@ -106,11 +106,11 @@ class ReconstructedFields:
 
 
 class ParticleSpectra:
-    """Energy spectra of particles: of the modes that a least-squares fit finds in their velocities.
+    """Energy spectra of particles, from the modes that a least-squares fit finds in their velocities.
 
     These are the modes of the closure's resolved velocity, with the same wavenumbers for all methods. No kernel
-    attenuates them, and they miss the same part of model and truth. Every solve starts from 0, in single precision,
-    in which frames are stored.
+    attenuates them, and the same wavenumbers are missing in model and truth. Every solve starts from 0 and is in
+    single precision, like the stored frames.
 
     Particles without a force between them cluster and leave voids, where only the weak prior determines the modes.
     The equations become stiff: without a force for T/2 a solve takes 167 iterations in `hit` and 121 in `hit-coarse`
@@ -119,7 +119,7 @@ class ParticleSpectra:
 
     Parameters
     ----------
-    scales : of the flow. length : edge of the box. alone : a communicator of one rank.
+    scales : scales of the flow. length : edge of the box. alone : a communicator of one rank.
     """
 
     def __init__(self, scales: ReferenceScales, length: float, alone: Comm) -> None:
@@ -139,7 +139,7 @@ class ParticleSpectra:
         self.__dict__.pop("_resolution", None)
 
     def of(self, particles: Frames, frame: int, whose: str) -> np.ndarray:
-        """E(k) of the shells 0, 1, ... whose modes are all resolved, at least two. `whose` names the particles."""
+        """E(k) of the shells 0, 1, ... whose modes are all resolved, at least of two. `whose` names the particles."""
         position, velocity = (particles.read(frame, name).astype(float) for name in ("position", "velocity"))
         with torch.no_grad():
             flow = self._resolution.of(ParticleSet.from_numpy(

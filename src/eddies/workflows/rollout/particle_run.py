@@ -188,7 +188,7 @@ def forcing_of(power: str | float, section: ForcingSection | None, truth: Ground
     """The forcing of a rollout, None without one.
 
     `power` is [simulation] injection: "truth" means the forcing of the ground truth, "dissipation" its dissipation
-    rate, a number the power per mass. The last two act at the wavenumbers of `section`, which is [forcing].
+    rate, a number the power per mass, "none" no forcing. Rates and numbers act at the wavenumbers of `section`.
     """
     if power == "truth":
         return truth.forcing

@@ -34,7 +34,7 @@ def saved_rows(comm: Comm, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 def restored_rows(slab: SlabDecomposition, saved: Checkpoint) -> tuple[dict[str, np.ndarray], bool]:
     """The columns of this rank, and whether they are exactly the rows that it saved. On another number of ranks the
-    columns are those of the particles in its slab. Collective."""
+    columns are those of the particles in this rank's slab. Collective."""
     rows = saved["rows_of_ranks"]
     same = len(rows) == slab.size
     starts = np.concatenate([[0], np.cumsum(rows)]) if same else block_starts(int(rows.sum()), slab.size)
