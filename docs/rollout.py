@@ -16,6 +16,7 @@ from eddies.report.rollout_figures import velocity_planes
 from eddies.workflows.rollout.measured import open_rollout
 
 SHOWN = 4  # times
+COLOURS, WIDTH = 96, 1200  # of the picture
 
 
 def picture(run: Path, variants: list[str]) -> bytes:
@@ -31,4 +32,5 @@ def picture(run: Path, variants: list[str]) -> bytes:
 
 if __name__ == "__main__":
     image = Image.open(io.BytesIO(picture(Path(sys.argv[1]), sys.argv[2:]))).convert("RGB")
-    image.quantize(160).save(Path(__file__).parent / "rollout.png", optimize=True)  # a third of the size
+    image.thumbnail((WIDTH, WIDTH))
+    image.quantize(COLOURS).save(Path(__file__).parent / "rollout.png", optimize=True)
