@@ -16,7 +16,7 @@ from eddies.report.rollout_figures import velocity_planes
 from eddies.workflows.rollout.measured import open_rollout
 
 SHOWN = 4  # times
-COLOURS, WIDTH = 96, 1200  # of the picture
+COLOURS, WIDTH = 128, 1100  # of the picture
 
 
 def picture(run: Path, variants: list[str]) -> bytes:
