@@ -23,9 +23,12 @@ from eddies import open_run
 from eddies.analysis.against_truth import EDGES, conditional_flows, last_invariants, pdf_divergence
 from eddies.analysis.pdfs import bin_edges, bin_probabilities, gaussian, kl_divergence, pdf, standardized
 from eddies.analysis.rollout import Rollout
+from eddies.flow.statistics import energy_spectrum
+from eddies.parallel.slab import SlabDecomposition
 from eddies.report.figures import (DNS, FILTERED, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, guide_power_law,
                                    legend_at_foot, letter, note, number_wavenumbers, panels, png, styled)
 from eddies.report.rollout_figures import invariant_plane, velocity_planes, vorticity_and_energy
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.stored_run import StoredRun
 from eddies.workflows.rollout.measured import open_rollout
 
@@ -95,11 +98,11 @@ def figure_3(numbers: dict[str, dict]):
 
 
 def figure_4(rollouts: dict[str, Rollout]):
-    """Draw u_x in the plane z = pi over time: true tracers above, models below."""
+    """Draw u_x in the plane z = pi over time: true tracers above, models below, by label."""
     first = next(iter(rollouts.values()))
     shown = first.common.spread(4)
     rows = {"true tracers": [first.both(first.planes, index)[1] for index in shown]}
-    rows |= {MODELS[name][0]: [run.both(run.planes, index)[0] for index in shown] for name, run in rollouts.items()}
+    rows |= {label: [run.both(run.planes, index)[0] for index in shown] for label, run in rollouts.items()}
     return velocity_planes(rows, first.common.times[list(shown)] / first.turnover)
 
 
@@ -175,22 +178,18 @@ def figure_8(rows: list[tuple[str, dict[str, Rollout], dict[str, StoredRun]]]):
 
 def draw_spectrum(axis, field, cutoff: float, **line) -> None:
     """Draw the spectrum of a field (3, n, n, n) up to k_d, summed over shells of unit width."""
-    field = np.asarray(field, dtype=float)
     cells = field.shape[-1]
-    modes = np.fft.fftn(field, axes=(1, 2, 3)) / cells**3
-    numbers = np.fft.fftfreq(cells, 1 / cells)
-    shell = np.rint(np.sqrt(sum(part**2 for part in np.meshgrid(numbers, numbers, numbers)))).astype(int)
-    energy = np.bincount(shell.ravel(), (np.sum(np.abs(modes)**2, axis=0) / 2).ravel())
-    wavenumber = np.arange(1, int(cutoff) + 1)
-    axis.loglog(wavenumber, energy[wavenumber], **line)
+    grid = SpectralGrid(SlabDecomposition(MPI.COMM_SELF, 2 * np.pi, cells), cutoff=(cells - 1) // 2)
+    wavenumber, energy = energy_spectrum(grid, grid.forward(np.asarray(field, dtype=float)))
+    shown = (wavenumber >= 1) & (wavenumber <= cutoff)
+    axis.loglog(wavenumber[shown], energy[shown], **line)
 
 
-def save(name: str, figure) -> None:
+def save(path: Path, figure) -> None:
     """Write a picture with few colours."""
-    HERE.mkdir(exist_ok=True)
     image = Image.open(io.BytesIO(png(figure))).convert("RGB")
     image.thumbnail((WIDTH, 2 * WIDTH))
-    image.quantize(COLOURS).save(HERE / f"{name}.png", optimize=True)
+    image.quantize(COLOURS).save(path, optimize=True)
 
 
 def main(arguments: list[str]) -> None:
@@ -204,11 +203,11 @@ def main(arguments: list[str]) -> None:
         if name == "training":
             continue
         shutil.copy(run.path / "report/variants.json", NUMBERS.parent / f"paper-{name}.json")
-    save("figure-3", figure_3(numbers))
+    save(HERE / "figure-3.png", figure_3(numbers))
     if "training" in runs:
         drawn = runs["training"].variant("paper").figures
-        save("figure-1", drawn["figure-1-kernels"])
-        save("figure-2", drawn["figure-2-reconstruction"])
+        save(HERE / "figure-1.png", drawn["figure-1-kernels"])
+        save(HERE / "figure-2.png", drawn["figure-2-reconstruction"])
     if not {"mt008", "mt016"} <= {*runs}:
         return
     with ExitStack() as files:
@@ -216,13 +215,13 @@ def main(arguments: list[str]) -> None:
                                                                    MPI.COMM_SELF)).rollout for variant in MODELS}
                   for name in ("mt016", "mt008")}
         rollouts = opened["mt016"]
-        save("figure-4", figure_4(rollouts))
-        save("figure-5", figure_5(rollouts))
-        save("figure-6", figure_6(rollouts))
+        save(HERE / "figure-4.png", figure_4({MODELS[name][0]: run for name, run in rollouts.items()}))
+        save(HERE / "figure-5.png", figure_5(rollouts))
+        save(HERE / "figure-6.png", figure_6(rollouts))
         run = rollouts["paper-forced"]
         statistics = last_invariants(run)
-        save("figure-7", invariant_plane(statistics, conditional_flows(run, statistics.bins)))
-        save("figure-8", figure_8([(f"$M_t = {mach_number(runs[name]):.2f}$", found,
+        save(HERE / "figure-7.png", invariant_plane(statistics, conditional_flows(run, statistics.bins)))
+        save(HERE / "figure-8.png", figure_8([(f"$M_t = {mach_number(runs[name]):.2f}$", found,
                                     {variant: runs[name].variant(variant) for variant in MODELS})
                                    for name, found in opened.items()]))
 

@@ -167,11 +167,14 @@ def made(case: Case, run: Path, seed: int, rest: str, stages: Sequence[str] | No
 
 def fields_of(case: Case, run: Path, seed: int) -> dict[str, float]:
     """Mean errors of the reconstructed fields of a case; collective."""
+    comm, found = MPI.COMM_WORLD, None
     with h5py.File(run / case.tracks / "ground_truth.h5") as truth:
         cells = 2 * truth["fields/filtered"].attrs["cells"]
         directory = made(case, run, seed, f'[reconstruction]\nmethod = "{case.method}"\ncells = {cells}\n'
                          'fields = ["velocity", "pressure"]\n', ["dns", "reconstruct"])
-        return {name: values.mean() for name, values in errors_of(case, directory, truth).items()}
+        if comm.rank == 0:
+            found = {name: values.mean() for name, values in errors_of(case, directory, truth).items()}
+    return comm.bcast(found)
 
 
 def forecasts_of(tracks: str, run: Path, seed: int) -> dict[str, dict[str, float]]:

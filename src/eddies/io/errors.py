@@ -59,6 +59,7 @@ def read_error(path: Path | str, error: OSError) -> ProductError | None:
                         "the file system, or give another path")
 
 
-def remedy_for(kind: str) -> str:
-    """The remedy for a product that cannot be used. Its stage would keep the file, so the user has to remove it."""
-    return f"remove it and run `eddies {MAKER_OF[kind].name}` again" if kind in MAKER_OF else "make it again"
+def remedy_for(kind: str, file: str = "it") -> str:
+    """The remedy for a product that cannot be used. Its stage would keep the file, so the user has to remove it.
+    `file` is how the sentence names it."""
+    return f"remove {file} and run `eddies {MAKER_OF[kind].name}` again" if kind in MAKER_OF else "make it again"

@@ -55,7 +55,8 @@ class VelocityVerlet(Integrator):
     scheme = SCHEMES["verlet"]
 
     def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:
-        """Particles between two steps and their rates, evaluated anew: `memory` has rates at a predicted velocity."""
+        """Particles between two steps and their rates. They are evaluated, because `memory` holds rates at a predicted
+        velocity."""
         if particles is not self._last:  # the last ones are on their ranks already
             particles, _ = self.dynamics.settle(particles)
         return particles, self.dynamics.rates(particles, time=self.dynamics.time)

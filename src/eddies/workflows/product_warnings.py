@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from eddies.io.errors import remedy_for
 from eddies.io.hdf5 import File, read_attributes, stored_numbers
 from eddies.io.provenance import product_provenance
 from eddies.pipeline import MAKER_OF
@@ -30,7 +31,7 @@ def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
             named = " and from ".join(_other(needed, origin, present) for needed, present in others.items())
             or_else = ("note that the report compares different flows or models" if any(others.values()) else
                        "restore the missing file")
-            found.append(f"{_made(kind, origin)} was made from {named}: {_remedy_for(kind)}, or {or_else}")
+            found.append(f"{_made(kind, origin)} was made from {named}: {remedy_for(kind, MAKER_OF[kind].file)}, or {or_else}")
     return found
 
 
@@ -40,8 +41,8 @@ def changed_truths(origin: Provenance) -> list[str]:
     `origin` is the provenance of the model. Removed ground truths are skipped.
     """
     now = {path: product_provenance(path).get("id") for path in origin.get("truths", {})}
-    return [f"{_made('model', origin)} was trained on {path}, which has changed since then; {_remedy_for('model')}, or "
-            "note that the model has learned from another flow"
+    return [f"{_made('model', origin)} was trained on {path}, which has changed since then; "
+            f"{remedy_for('model', MAKER_OF['model'].file)}, or note that the model has learned from another flow"
             for path, known in origin.get("truths", {}).items() if now[path] not in (None, known)]
 
 
@@ -62,12 +63,8 @@ def not_finite(file: File, kind: str) -> str:
         return ""
     more = f" and {len(places) - MOST_NAMED} more" if len(places) > MOST_NAMED else ""
     status = read_attributes(file, "rollout")["status"] if kind == "rollout" else "complete"
-    remedy = _remedy_for(kind) if status == "complete" else f"the rollout {status}"
+    remedy = remedy_for(kind, MAKER_OF[kind].file) if status == "complete" else f"the rollout {status}"
     return f"{MAKER_OF[kind].file} holds numbers that are not finite ({'; '.join(places[:MOST_NAMED])}{more}): {remedy}"
-
-
-def _remedy_for(kind: str) -> str:
-    return f"remove {MAKER_OF[kind].file} and run `eddies {MAKER_OF[kind].name}` again"
 
 
 def _made(kind: str, origin: Provenance) -> str:
