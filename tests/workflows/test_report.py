@@ -341,6 +341,22 @@ def test_a_flow_at_rest(comm, tmp_path, own):
 
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
+@pytest.mark.parametrize("section, words", [
+    ("tracers", "Tracers follow the whole flow. It is not forced."), ("tracks", "Tracers follow the whole flow.")])
+def test_tracers_of_the_whole_flow_are_described_as_such(comm, tmp_path, section, words):
+    """The forcing of measured tracks is unknown, so nothing is said of it."""
+    write_ground_truth(comm, tmp_path, frames=3)
+    with changed(tmp_path / "ground_truth.h5") as file:
+        origin = json.loads(file.attrs["provenance"])
+        file.attrs["provenance"] = json.dumps(origin | {"scene": f"[{section}]\nfiltered = false\n"})
+        if section == "tracks":
+            file.create_group("tracks").attrs.update(in_file=9, file="tracks.h5", mean_count=8.0, complete=7)
+    report.run(tmp_path, comm)
+    assert f"<p>{words}</p>" in written(tmp_path)[1]
+
+
+@pytest.mark.usefixtures("no_figures")
+@pytest.mark.mpi(1)
 def test_a_rollout_without_its_ground_truth(comm, tmp_path):
     write_rollout(comm, tmp_path)
     report.run(tmp_path, comm)
