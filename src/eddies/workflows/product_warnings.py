@@ -31,7 +31,8 @@ def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
             named = " and from ".join(_other(needed, origin, present) for needed, present in others.items())
             or_else = ("note that the report compares different flows or models" if any(others.values()) else
                        "restore the missing file")
-            found.append(f"{_made(kind, origin)} was made from {named}: {remedy_for(kind, MAKER_OF[kind].file)}, or {or_else}")
+            found.append(f"{_made(kind, origin)} was made from {named}: "
+                         f"{remedy_for(kind, MAKER_OF[kind].file)}, or {or_else}")
     return found
 
 
