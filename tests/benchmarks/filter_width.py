@@ -3,8 +3,9 @@
     .venv/bin/python tests/benchmarks/filter_width.py docs/results/compare-small.json docs/results/compare-hit.json \
         docs/results/compare-coarse.json docs/results/compare-256.json docs/error-over-filter-width.png
 
-It shows the variants of the same names in all comparisons, and the best coarse grid: the one with the smallest error
-of those that take no longer than the learned model in the same run.
+It shows the variants of the same names in all comparisons, and the best coarse grids: those with the smallest error of
+all that take no longer than the resolved velocity in the same run, once with exact modes of the flow at the start, once
+with modes found in the velocities of the particles.
 """
 
 import json
@@ -22,9 +23,11 @@ from eddies.report.figures import DNS, FILTERED, FOURTH, MODEL, SECOND, THIRD, T
 
 DRAWN = ("velocity_error_half", "acceleration_kl")
 # Label, colour and marker of the variants.
-MARKERS = {"resolved": ("the resolved velocity", MODEL, "o"), "grid": ("best grid of its cost", TRUTH, "s"),
+MARKERS = {"resolved": ("the resolved velocity", MODEL, "o"),
+           "grid": ("best grid of its cost, exact start", TRUTH, "s"),
+           "grid-particles": ("the same, start from particles", DNS, "^"),
            "paper": ("the published form", THIRD, "D"), "transport-velocity": ("transport-velocity SPH", FOURTH, "v"),
-           "local": ("only neighbours", SECOND, "P"), "no-force": ("no force", DNS, "x")}
+           "local": ("only neighbours", SECOND, "P"), "no-force": ("no force", FILTERED, "x")}
 
 Row = Mapping[str, Any]
 
@@ -34,9 +37,11 @@ def width_of(result: Mapping[str, Any]) -> float:
     return result["flow"]["filter_width"] / result["flow"]["kolmogorov_length"]
 
 
-def best_grid(rows: Mapping[str, Row], measure: str) -> Row | None:
-    """The coarse grid with the smallest error of those that take no longer than the learned model."""
+def best_grid(rows: Mapping[str, Row], measure: str, of_particles: bool) -> Row | None:
+    """The grid with the smallest error of those that take no longer than the resolved velocity. `of_particles`: of
+    those that start from the particles."""
     rivals = [row for row in rows.values() if row["method"] == "eulerian"
+              and row["name"].endswith("-particles") == of_particles
               and None not in (row[measure], row["wall_seconds"])
               and row["wall_seconds"] <= rows["resolved"]["wall_seconds"]]
     return min(rivals, key=lambda row: row[measure], default=None)
@@ -48,7 +53,7 @@ def points(results: Iterable[Mapping[str, Any]], name: str, measure: str) -> lis
     found = []
     for result in results:
         rows = {row["name"]: row for row in result["rows"] if is_stable(row)}
-        row = best_grid(rows, measure) if name == "grid" else rows.get(name)
+        row = best_grid(rows, measure, name != "grid") if name.startswith("grid") else rows.get(name)
         if row is None or row[measure] is None:
             found.append((width_of(result), math.nan, 0.0, name))
         else:
@@ -83,5 +88,6 @@ if __name__ == "__main__":
     *sources, target = map(Path, sys.argv[1:])
     given = [json.loads(source.read_text()) for source in sources]
     for each in DRAWN:
-        print(each, *(f"d/eta {at:.1f}: {name} {error:.3g}" for at, error, _, name in points(given, "grid", each)))
+        for start in "grid", "grid-particles":
+            print(each, *(f"d/eta {at:.1f}: {name} {error:.3g}" for at, error, _, name in points(given, start, each)))
     target.write_bytes(png(drawn(given)))

@@ -1,12 +1,14 @@
 """Fields from tracks of a simulated flow beside the true fields: methods, noise, lost tracks, a volume. A script.
 
     mpirun -n 2 .venv/bin/eddies dns tests/validation/tracks.toml [--set seed=3 --output runs/tracks-3]
-    mpirun -n 2 .venv/bin/python tests/validation/twin_tracks.py runs/tracks [runs/tracks-3 ...]
+    mpirun -n 2 .venv/bin/python tests/validation/twin_tracks.py hit runs/tracks [runs/tracks-3 ...]
+    mpirun -n 2 .venv/bin/eddies dns tests/validation/tracks-256.toml
+    mpirun -n 2 .venv/bin/python tests/validation/twin_tracks.py hit-256 runs/tracks-256
 
 Writes the tracks of each case as a user would have them, reconstructs them, and compares the fields, after the filter
 of the stored ones, with these. Then forecasts the flow from the first field: the model `resolved` with weights of
 another flow of `hit`, and grids that start from the particles. Prints means over the runs, of fields at all times after
-the first t_eta, and the standard deviations of several runs, and writes docs/results/tracks.json.
+the first t_eta, and the standard deviations of several runs, and writes docs/results/tracks-NAME.json.
 """
 
 import json
@@ -23,7 +25,7 @@ from mpi4py import MPI
 
 import eddies
 
-HERE = Path(__file__).parents[2] / "docs/results/tracks.json"
+RESULTS = Path(__file__).parents[2] / "docs/results"
 BOX = 2 * np.pi
 TURNOVER_LOSS = 0.2  # share of the tracks that is lost at random in a turnover
 
@@ -44,9 +46,10 @@ class Case:
     inner: float = 1.0
 
 
-CASES = [
-    *(Case(name, method) for name in ("whole-8", "whole-16", "whole-32", "filtered-16", "filtered-32")
-      for method in ("least-squares", "memory")),
+SETS = {"hit": ("whole-8", "whole-16", "whole-32", "filtered-16", "filtered-32"),
+        "hit-256": ("whole-16", "whole-32", "filtered-16", "filtered-32")}
+# Done to the tracks of `hit` alone.
+FURTHER = [
     *(Case(name, method) for name in ("whole-16", "filtered-32") for method in ("kriging", "quadratic", "average")),
     *(Case("whole-16", method, splines=True) for method in ("least-squares", "memory")),
     *(Case("whole-16", method, noise) for noise in (0.1, 0.3) for method in ("least-squares", "memory")),
@@ -71,7 +74,8 @@ simulation.method = "eulerian"
 eulerian.cells = {cells}
 eulerian.start = "particles"
 """
-WEIGHTS = {"filtered-16": "eddies:hit-coarse", "filtered-32": "eddies:hit"}
+WEIGHTS = {"hit": {"filtered-16": "eddies:hit-coarse", "filtered-32": "eddies:hit"},
+           "hit-256": {"filtered-16": "eddies:hit-256", "filtered-32": "eddies:hit-256"}}
 COLUMNS = "velocity_error_early", "velocity_error_half", "wall_seconds"
 
 
@@ -177,12 +181,12 @@ def fields_of(case: Case, run: Path, seed: int) -> dict[str, float]:
     return comm.bcast(found)
 
 
-def forecasts_of(tracks: str, run: Path, seed: int) -> dict[str, dict[str, float]]:
+def forecasts_of(tracks: str, weights: str, run: Path, seed: int) -> dict[str, dict[str, float]]:
     """Errors and seconds a turnover of the forecasts of a set of tracks, by method; collective."""
     with h5py.File(run / tracks / "ground_truth.h5") as truth:
         times, limit = truth["particles/tracers/position/time"][:2], float(truth["reference"].attrs["kolmogorov_time"])
     step = float(times[1] - times[0])
-    rest = FORECAST.format(weights=WEIGHTS[tracks], interval=step * int(limit / step))
+    rest = FORECAST.format(weights=weights, interval=step * int(limit / step))
     directory = made(Case(tracks), run, seed, rest + "".join(GRID.format(cells=cells) for cells in (32, 48)))
     rows = json.loads((directory / "report/variants.json").read_text(encoding="utf-8"))["rows"]
     return {row["name"]: {key: row[key] for key in COLUMNS} for row in rows}
@@ -195,20 +199,23 @@ def combined(found: list[dict[str, float]]) -> dict[str, float]:
     return {name: float(np.mean(each)) for name, each in values.items()} | spreads
 
 
-def main(runs: list[Path]) -> None:
-    """Run all cases and forecasts on all flows."""
+def main(name: str, runs: list[Path]) -> None:
+    """Run all cases and forecasts on some flows of the scene `name`."""
+    cases = [Case(tracks, method) for tracks in SETS[name] for method in ("least-squares", "memory")]
+    cases += FURTHER if name == "hit" else []
     fields = [case.__dict__ | combined([fields_of(case, run, seed) for seed, run in enumerate(runs)])
-              for case in CASES]
+              for case in cases]
     forecasts = []
-    for tracks in WEIGHTS:
-        found = [forecasts_of(tracks, run, seed) for seed, run in enumerate(runs)]
-        forecasts += [{"tracks": tracks, "method": name} | combined([each[name] for each in found])
-                      for name in found[0]]
+    for tracks, weights in WEIGHTS[name].items():
+        found = [forecasts_of(tracks, weights, run, seed) for seed, run in enumerate(runs)]
+        forecasts += [{"tracks": tracks, "method": method} | combined([each[method] for each in found])
+                      for method in found[0]]
     if MPI.COMM_WORLD.rank == 0:
-        HERE.write_text(json.dumps({"fields": fields, "forecasts": forecasts}, indent=1) + "\n", encoding="utf-8")
+        text = json.dumps({"fields": fields, "forecasts": forecasts}, indent=1) + "\n"
+        (RESULTS / f"tracks-{name}.json").write_text(text, encoding="utf-8")
         for row in [*fields, *forecasts]:
             print(row)
 
 
 if __name__ == "__main__":
-    main([Path(path) for path in sys.argv[1:]])
+    main(sys.argv[1], [Path(path) for path in sys.argv[2:]])

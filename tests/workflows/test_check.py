@@ -89,6 +89,8 @@ def test_what_is_unknown_is_null(comm, capfd, own, caplog):
     found = json_of(load_scene("abc"), comm, capfd)
     assert found["turbulence"] is found["particles"] is found["kernel_support"] is found["mach_turbulent"] is None
     assert found["rollouts"] == {"abc": None}
+    sets = load_scene(TINY, ["tracers.few.particles_per_side=4"], ["model", "training", "simulation", "kernel"])
+    assert [row["stage"] for row in json_of(sets, comm, capfd)["stage_costs"]] == ["dns", "report"]
     own("own_start", "def swirl(grid, initial, seed): pass\n")
     scene = replace(load_scene("taylor-green", ["initial.kind=own_start:swirl"]), time=Time(duration=1))
     assert check.numbers(scene, comm)["stage_costs"][0]["seconds"] is None

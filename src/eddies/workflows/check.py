@@ -1,4 +1,4 @@
-"""`eddies check`: estimates of a scene before a run, and its problems. It writes no file."""
+"""`eddies check`: estimates and problems of a scene before a run. The command writes no file."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
 
 
 def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
-    """Return all estimates by the keys that docs/check.md describes, None if unknown; all ranks call it."""
+    """Return all estimates, with the keys that docs/check.md describes. Unknown ones are None. All ranks call it."""
     expected, tracers, k_max = estimate(scene), scene.tracers, scene.flow.largest_wavenumber
     rollout_of = {name: estimate(each).rollout for name, each in (scene.variant or {scene.name: scene}).items()}
     context = context_here(scene.stages_of_all, scene.directory, comm)
@@ -57,7 +57,8 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
     for step in sorted(planned, key=lambda step: [None, *scene.variant].index(step.variant)):
         for stage in step.stages:
             work.setdefault((step.variant, stage), []).append(step.scene)
-    work[None, "report"] = [run.scene for runs in rollouts(scene, scene.directory).values() for run in runs]
+    pages = [run.scene for runs in rollouts(scene, scene.directory).values() for run in runs]
+    work[None, "report"] = pages or [scene]
     costs = [cost(variant, stage, scenes, comm.size) for (variant, stage), scenes in work.items()]
     return {
         "scene": scene.name, "stages": list(scene.stages_of_all), "cells": scene.flow.cells,
@@ -81,7 +82,11 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
 
 
 def cost(variant: str | None, stage: str, scenes: Sequence[Scene], ranks: int) -> dict[str, Any]:
-    """Cost of a stage for some scenes: wall time, memory and disk, on `ranks` ranks and on as many as it can use."""
+    """Cost of a stage for some scenes, a row of `stage_costs`; times in seconds, memory of a rank and disk in bytes.
+
+    `seconds` and `memory` are for `ranks` ranks, `least_seconds` and `least_memory` for the most that the stage can
+    use, `most_ranks`. The stage leaves `disk` and removes `scratch` at its end.
+    """
     most = min(min(most_ranks(each.ground_truth_alone if stage == "dns" else each).values()) for each in scenes)
 
     def total(values: Sequence[float | None]) -> float | None:
@@ -97,7 +102,7 @@ def cost(variant: str | None, stage: str, scenes: Sequence[Scene], ranks: int) -
 
 
 def lines(found: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield the estimates as text: subject and line."""
+    """Yield the estimates as text, each as a pair of subject and line."""
     for key, value in found.items():
         if key == "limits":
             yield from ((key, f"{ranks}: {reason}") for reason, ranks in value.items())
