@@ -1,1 +1,1 @@
-"""Tools around MPI: set-up, launcher, doctor and the pytest plugin. Of eddies they import only `cores`."""
+"""Tools around MPI: set-up, launcher, doctor and the pytest plugin. From eddies they import only `cores`."""

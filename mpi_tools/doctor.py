@@ -17,7 +17,7 @@ import numpy as np
 
 RING_NUMBERS = 1 << 20
 RING_ROUNDS = 20
-STARTED = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS")  # variables of launchers, the innermost first
+STARTED = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS")  # number of ranks; innermost launcher first
 
 
 def versions() -> tuple[str, list[str]]:
@@ -43,7 +43,7 @@ def versions() -> tuple[str, list[str]]:
 
 
 def accelerator(torch) -> str:
-    """Return the name of the GPU that a rank on this host would use."""
+    """Return the number and the name of the GPUs of this host, or "no GPU"."""
     if not torch.cuda.is_available():
         return "no GPU"
     return f"{torch.cuda.device_count()} x {torch.cuda.get_device_name(0)}"

@@ -5,8 +5,8 @@ A second signal other than SIGUSR1 ends the job at once.
 
     python mpi_tools/launch.py [-n RANKS] -- COMMAND...
 
-RANKS is the number of cores divided by OMP_NUM_THREADS, or EDDIES_RANKS if that is smaller. Variables that are already
-set do not change.
+By default RANKS is the number of cores divided by OMP_NUM_THREADS, or EDDIES_RANKS if that is smaller. Environment
+variables that are already set do not change.
 """
 
 import argparse
@@ -22,8 +22,8 @@ from pathlib import Path
 sys.path.append(str(Path(__file__).parents[1] / "src"))  # of this checkout, if eddies is not installed yet
 from eddies.cores import check_threads, default_to_one_thread, is_positive, local_cores, threads  # noqa: E402
 
-# The frame of mpirun's notices, the beginnings of those about a rank with a non-zero exit code, and the exit codes that
-# the ranks have explained themselves: bad input, stopped, interrupted.
+# The line above and below a notice of mpirun, how notices about a non-zero exit code begin, and the exit codes whose
+# reason the ranks have printed themselves: bad input, stopped, interrupted.
 RULE = b"-" * 74
 NOTICES = (b"Primary job  terminated normally", b"mpirun detected that one or more processes exited with non-zero",
            b"prterun detected that one or more processes exited with non-zero")
@@ -81,7 +81,7 @@ class ErrorOutput:
         self._line, self._frame, self._held, self._said, self._midway = b"", [], b"", False, False
 
     def pass_on(self, content: bytes) -> bytes:
-        """Return the bytes to write now. Notices, and a line that may be their frame, are held back."""
+        """Return the bytes to write now. Notices, and a line with which one may begin, are held back."""
         *lines, self._line = (self._line + content).split(b"\n")
         passed = b"".join(self._pass_line(line + b"\n") for line in lines)
         if self._line and not self._frame and not RULE.startswith(self._line):
@@ -89,7 +89,7 @@ class ErrorOutput:
         return passed
 
     def rest(self) -> bytes:
-        """Return the rest at the end, with the notices if the ranks said nothing or their exit code means a fault."""
+        """Return the rest at the end. It has the notices if the ranks wrote nothing or no exit code is in EXPLAINED."""
         explained = self._said and any(f"Exit code:    {code}\n".encode() in self._held for code in EXPLAINED)
         return (b"" if explained else self._held) + b"".join(self._frame) + self._line
 
@@ -126,7 +126,7 @@ def pass_errors_on(job: subprocess.Popen) -> None:
 def run_job(line: list[str], environment: dict[str, str]) -> int:
     """Run mpirun to its end. Return its exit code, or 128 plus the number of the signal that ended it.
 
-    mpirun kills its ranks soon after a SIGTERM and returns its own code. It only forwards SIGUSR1.
+    mpirun kills its ranks soon after a SIGTERM and returns a code of its own. It only forwards SIGUSR1 to the ranks.
     """
     terminations: list[int] = []
 

@@ -5,11 +5,12 @@
         assert comm.allreduce(1) == comm.size
 
 The pytest process that the user starts (outer) never initialises MPI, because Open MPI 4 cannot start mpirun from a
-process that has. It starts one `mpirun -n RANKS python -m pytest MODULES` (inner) for all selected tests with the same
-number of ranks, because starting ranks takes longer than most tests. Every rank writes JSON lines, from which each test
-is reported. If the ranks disagree about a test, or it exceeds its time limit, that mpirun ends and a new one runs the
-tests after it. Tests run in the order of their numbers of ranks. Several mpirun share the modules with one-rank tests.
-All ranks of a test have the same `tmp_path`, but not the same `tmp_path_factory`.
+process that has initialised it. The outer process starts one `mpirun -n RANKS python -m pytest MODULES` (inner) for all
+selected tests with the same number of ranks, because starting ranks takes longer than most tests. Every rank writes
+JSON lines, from which each test is reported. If the ranks disagree about a test, or the test exceeds its time limit,
+this mpirun ends and a new one runs the following tests. Tests run in the order of their numbers of ranks. Several
+mpirun share the modules with one-rank tests. All ranks of a test have the same `tmp_path`, but not the same
+`tmp_path_factory`.
 """
 
 import gc
@@ -28,8 +29,8 @@ import pytest
 from mpi_tools.launch import local_cores, mpi_environment, mpirun_command
 
 TIMEOUT = 120.0  # seconds for one test on all its ranks
-STALL = 60.0     # seconds without a result, beyond the time limit, after which mpirun itself is given up
-BESIDE = 4       # largest number of mpirun of one rank that run at the same time
+STALL = 60.0     # seconds beyond the time limit of a test; then mpirun is stopped if there is no result
+BESIDE = 4       # largest number of one-rank mpirun at the same time
 
 
 def pytest_addoption(parser):
@@ -93,11 +94,11 @@ def tmp_path(request, pytestconfig, tmp_path):
 
 
 class OuterRun:
-    """Replaces each marked test by an `MpiItem` and starts the mpirun of their ranks."""
+    """Replaces each marked test by an `MpiItem`, and starts the mpirun that run these tests."""
 
     def __init__(self, config):
         self.config = config
-        self.runs, self.reported, self.ahead = [], None, False  # ahead: ranks start before they are reported
+        self.runs, self.reported, self.ahead = [], None, False  # ahead: tests start before their turn
         self.waiting = {}  # ranks -> items still to be reported, in order
 
     @pytest.hookimpl(trylast=True)
@@ -111,7 +112,8 @@ class OuterRun:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session):
-        """Start several mpirun for the tests on one rank, beside the tests without ranks, to keep all cores busy."""
+        """Start several mpirun for the tests on one rank. They keep all cores busy while this process runs the tests
+        that are not marked."""
         group, cores, shown = self.waiting.get(1), local_cores(), session.config.option.capture == "no"
         if group and cores > 1 and not shown and not session.config.option.collectonly:
             os.environ.setdefault("OMPI_MCA_mpi_yield_when_idle", "1")  # a waiting rank yields its core
@@ -119,7 +121,7 @@ class OuterRun:
             self.ahead = True
 
     def pytest_runtest_logfinish(self):
-        """Start the next tests when the ranks before them have ended, even if not all of those are reported yet."""
+        """Start the tests on the next number of ranks when all runs have ended, even if results wait to be reported."""
         if self.ahead and self.runs and all(run.process.poll() is not None for run in self.runs):
             later = [ranks for ranks in sorted(self.waiting) if ranks > max(run.ranks for run in self.runs)]
             for ranks in later[:1]:
@@ -139,7 +141,7 @@ class OuterRun:
         self.runs += [first, *(RankRun(self.config, items, first.taken) for _ in range(count - 1))]
 
     def records(self, item) -> list[dict]:
-        """Return the records of all ranks for a test; if no mpirun reaches it, start one with it."""
+        """Return the records of all ranks for a test. If no mpirun reaches the test, start one that begins with it."""
         group = self.waiting[item.ranks]
         del group[:group.index(item)]
         run = next((run for run in self.runs if run.reaches(item)), None)
@@ -211,7 +213,8 @@ class MpiItem(pytest.Item):
 class RankRun:
     """One mpirun of tests on a number of ranks. Several runs may share modules; the first that takes one runs it.
 
-    A run takes a module by a link in the common folder `taken`, named by the module's number, to its own folder.
+    To take a module, a run makes a link to its own folder. The link is in the common folder `taken` and is named by the
+    number of the module.
     """
 
     def __init__(self, config, items: list[MpiItem], taken: Path | None = None):
@@ -225,7 +228,7 @@ class RankRun:
         self.read, self.found = [0] * ranks, {}  # bytes read of each rank's records; entries by event and test
         self.output = open(self.folder / "output", "w+b")
         shown = config.option.capture == "no"
-        # Warnings of unraisableexception are not shown, and it collects garbage for a second at the end.
+        # The plugin unraisableexception is off: its warnings would not show, and it collects garbage for a second.
         inner = [sys.executable, "-m", "pytest", *map(str, self.modules), f"--mpi-run={self.folder}", "-q",
                  "--color=no", "-p", "mpi_tools.pytest_mpi", "-p", "no:cacheprovider", "-p", "no:unraisableexception",
                  f"--rootdir={config.rootpath}", f"--tb={config.option.tbstyle}",
@@ -238,7 +241,7 @@ class RankRun:
             start_new_session=True)
 
     def entries(self, item: MpiItem, event: str) -> dict[int, dict]:
-        """Return the entries of the ranks about the "start" or the "end" of a test so far."""
+        """Return, by rank, the entries written so far about the "start" or the "end" of a test."""
         for rank in range(self.ranks):
             path = self.folder / f"{rank}.jsonl"
             if not path.exists():
@@ -255,7 +258,8 @@ class RankRun:
         return self.found.get((event, item.nodeid), {})
 
     def wait(self, item: MpiItem, event: str, ranks: int) -> dict[int, dict]:
-        """Wait until this number of ranks have an entry of the event, the run ends, or another takes the module."""
+        """Wait until this number of ranks have an entry of the event, this run ends, or another run takes the module.
+        Return the entries."""
         give_up = time.monotonic() + item.timeout + STALL
         while len(self.entries(item, event)) < ranks and self.process.poll() is None and not self.leaves(item):
             if time.monotonic() > give_up:

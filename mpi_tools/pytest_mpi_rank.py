@@ -16,7 +16,8 @@ GRACE = 3.0  # seconds in which the other ranks must end a test that has failed 
 
 
 class InnerRun:
-    """Runs on this rank the tests of FOLDER/tests.json in modules that this run takes, and writes FOLDER/RANK.jsonl."""
+    """Runs the tests of FOLDER/tests.json on this rank, in the modules that this mpirun takes. Their results go to
+    FOLDER/RANK.jsonl."""
 
     def __init__(self, folder: Path):
         # A communicator of its own: messages that a failing test leaves on COMM_WORLD cannot arrive here.
@@ -35,7 +36,7 @@ class InnerRun:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session):
-        """Run the tests as pytest does, module by module. pytest ends a run whose modules cannot be collected."""
+        """Run the tests module by module. If a module could not be collected, pytest's own loop ends the run."""
         if session.testsfailed:
             return None
         for number, (_, items) in enumerate(groupby(session.items, key=lambda item: item.path)):
@@ -78,7 +79,8 @@ class InnerRun:
             session.exitstatus = pytest.ExitCode.OK
 
     def record(self) -> dict:
-        """Return the outcome of the test on this rank: the first of setup, call and teardown that did not pass."""
+        """Return the outcome of the test on this rank: that of the first phase (setup, call, teardown) that did not
+        pass, or of the last phase."""
         report = next((r for r in self.reports if not r.passed), self.reports[-1])
         return {"rank": self.comm.rank, "outcome": report.outcome, "phase": report.when,
                 "text": reason(report), "expected": hasattr(report, "wasxfail"),

@@ -1,7 +1,6 @@
 """The commands as Python functions. Each takes a scene, its name or its path, and returns when the work is done.
 
-All ranks call a function together. Besides the command line this is the only module that uses the communicator of the
-job.
+All ranks call a function together. Only this module and `cli` use MPI.COMM_WORLD, the communicator of the job.
 """
 
 from __future__ import annotations
@@ -41,10 +40,10 @@ def run(scene: Scene | str | Path, *, stages: Sequence[str] | None = None, outpu
 
     Parameters
     ----------
-    stages : such as "dns" and "train-kernel", run in the order of the pipeline; None for all stages of the scene.
+    stages : names such as "dns" and "train-kernel"; run in the order of the pipeline. None: all stages of the scene.
     output : the run directory.
-    overwrite : replace work of other settings, which is otherwise an error. Complete products of the same settings are
-        always kept.
+    overwrite : replace work of other settings; if it is False, such work is an error. Complete products of the same
+        settings are always kept.
     variants : the variants to run; empty for all.
     comm : the communicator; None for all ranks of the job.
 

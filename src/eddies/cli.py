@@ -59,8 +59,8 @@ def main(arguments: list[str] | None = None) -> int:
         complain(f"error: {refusal}")
         code = code or BAD_INPUT
     if code == INTERRUPTED:
-        # Python remembers an interrupt of code that is compiled from a string, as dataclasses do, until the next such
-        # code runs. Started with -m, it would then end by the signal (tests/test_bad_input.py, on interrupts).
+        # Python remembers an interrupt of code compiled from a string (dataclasses use such code) until such code runs
+        # again. A program started with -m would then end by the signal (tests/test_bad_input.py, on interrupts).
         exec("")
     if usage:
         sys.exit(code)
@@ -69,7 +69,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def run(arguments: list[str] | None) -> int:
     """Run one command on all ranks and return its exit code."""
-    # Before numpy and torch are imported, which would start a thread for each core in each rank.
+    # This precedes the imports of numpy and torch, which would start a thread for each core in each rank.
     default_to_one_thread()
     signals = catch_signals()  # early, because numpy and MPI take a second to start
     from eddies.kernels.library import keep_freed_memory
@@ -132,11 +132,11 @@ def complain(text: str, prefix: str = "eddies: ") -> None:
 
 
 def catch_signals() -> list[int]:
-    """Record signals that ask for a stop. Returns the list of their numbers so far, which stages check at each step.
+    """Record signals that ask for a stop. Returns the list that receives their numbers; stages check it at each step.
 
-    Schedulers send SIGUSR1 or SIGTERM before the time limit, the keyboard SIGINT, a closed terminal SIGHUP. A signal
-    that is ignored, as by nohup, stays ignored. The second signal of a kind, except SIGUSR1, ends the process at once.
-    At exit signals are ignored: the launcher may pass the same signal to each rank at a different moment.
+    Schedulers send SIGUSR1 or SIGTERM before the time limit; the keyboard sends SIGINT, and a closed terminal SIGHUP. A
+    signal that is ignored, as by nohup, stays ignored. The second signal of a kind, except SIGUSR1, ends the process at
+    once. At exit, signals are ignored: the launcher may pass the same signal to each rank at a different moment.
     """
     received: list[int] = []
 
@@ -144,7 +144,7 @@ def catch_signals() -> list[int]:
         received.append(number)
         if number != signal.SIGUSR1:
             signal.signal(number, signal.SIG_DFL)
-        if number == signal.SIGINT and sys.__stderr__ is not None:  # otherwise another file may have its number
+        if number == signal.SIGINT and sys.__stderr__ is not None:  # else another file may have the number of stderr
             with contextlib.suppress(OSError):  # a closed pipe or a full disk must not end the run
                 os.write(sys.__stderr__.fileno(), STOPPING)
 
@@ -161,7 +161,7 @@ def catch_signals() -> list[int]:
 
 
 def release_signals(received: list[int]) -> None:
-    """Let signals, also those received so far, end the process at once, for commands that take seconds."""
+    """Let signals end the process at once, also those received so far; used for commands that take seconds."""
     for number in STOP_SIGNALS:
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
@@ -172,9 +172,9 @@ def release_signals(received: list[int]) -> None:
 def end_with_error(error: BaseException, comm: Comm) -> int:
     """Report an error once and return its exit code, or end all ranks by MPI_Abort.
 
-    All ranks meet a mistake in the input together: rank 0 prints one line. MPI_Abort ends the job if only some ranks
-    meet the error, because the others may wait for them, and for an error that is not the user's. It also does so if
-    HDF5 could not write a file, because HDF5 then crashes at exit, and if only some ranks are interrupted.
+    If all ranks meet a mistake in the input or an interrupt, rank 0 prints one line. MPI_Abort ends the job in three
+    cases: only some ranks meet the error or interrupt, and the others may wait for them; with several ranks, the error
+    is not the user's; or HDF5 could not write a file, and would crash at exit.
     """
     from eddies.io.new_files import writing_failed
     interrupted = isinstance(error, KeyboardInterrupt)
@@ -250,7 +250,7 @@ def time_command(options: argparse.Namespace, comm: Comm, signals: list[int]) ->
 
 
 def checked_scenes(options: argparse.Namespace) -> list[Scene]:
-    """The scene of the command line, or the variants that it names."""
+    """The variants that the command line names, or the whole scene if it names none."""
     whole = load_scene(options.scene, options.overrides, options.removals)
     whole.check_variants(options.variants)
     return [whole.variant[name] for name in options.variants] or [whole]

@@ -90,7 +90,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def add_command(commands: argparse._SubParsersAction, name: str, about: str) -> argparse.ArgumentParser:
-    """A sub-command with its examples."""
+    """Add a sub-command with its examples, and return its parser."""
     form = argparse.RawDescriptionHelpFormatter
     return commands.add_parser(name, help=about, description=about, formatter_class=form,
                                epilog="\n  ".join(["examples:", *EXAMPLES[name]]))
@@ -106,7 +106,7 @@ class OptionError(UserError):
 
 
 def directory(text: str) -> Path:
-    """A directory of the command line, which may not exist yet."""
+    """A directory that is named on the command line; it need not exist."""
     if not text:
         raise OptionError("an empty text is not a directory; give a name, or . for the working directory")
     try:

@@ -1,4 +1,4 @@
-"""Simulated time, the ladder of step sizes, and the progress line."""
+"""Simulated time, the ladder of step sizes (each half the previous one), and the progress line."""
 
 from __future__ import annotations
 
@@ -54,25 +54,27 @@ class Clock:
 
 
 def ladder_step(largest: float, bound: float) -> float:
-    """The largest of largest * 2^-m, m = 0, 1, ..., that does not exceed `bound`. ValueError if it is not above 0."""
+    """The largest step of the ladder `largest` * 2^-m, m = 0, 1, ..., that does not exceed `bound`.
+
+    Raises ValueError if `bound` is not positive.
+    """
     if not bound > 0:
         raise ValueError(f"time step bound {bound} is not positive: the flow is no longer finite")
     return largest if bound >= largest else largest * 2.0 ** -math.ceil(math.log2(largest / bound))
 
 
 class ProgressLine:
-    """Logs progress and remaining time, every few seconds of wall time or, with --verbose, after every step. Call it
-    after every step.
+    """Logs progress and remaining time every few seconds of wall time, or after every step with --verbose.
 
-    The seconds per step are a median, without the first two steps and without the time of `storing`, whose share of the
-    wall time is given separately.
+    Call it after every step. The line gives the median of the seconds per step, without the first two steps and without
+    the time in `storing`. The share of `storing` in the wall time is given separately.
 
     Parameters
     ----------
     stage : first word of the line.
     describe : returns the state of the stage as text. It must not communicate, because only ranks that log call it.
     interval : wall seconds between two lines.
-    done : fraction of the stage that an earlier job has done, which does not count for the remaining time.
+    done : fraction of the stage that an earlier job has done; the estimate of the remaining time leaves it out.
     unit : name of what is counted.
     """
 
@@ -85,7 +87,7 @@ class ProgressLine:
 
     @contextmanager
     def storing(self) -> Iterator[None]:
-        """Within this block time does not count as part of a step."""
+        """Context whose time counts as storing, not as part of a step."""
         began = time.perf_counter()
         yield
         seconds = time.perf_counter() - began

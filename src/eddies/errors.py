@@ -2,4 +2,7 @@
 
 
 class UserError(Exception):
-    """The text names the mistake and the remedy. A command that ends with it prints one line and has exit code 2."""
+    """An error whose text names the mistake and the remedy.
+
+    A command that ends with this error prints one line and has exit code 2.
+    """

@@ -28,12 +28,12 @@ def is_path(name: str) -> bool:
 
 
 def short_name(name: str) -> str:
-    """Return the name for sections and logs: the built-in name, or the part of an import path after the colon."""
+    """Return the name for sections of a scene and for logs: a built-in name, or the part of a path after the colon."""
     return name.rpartition(":")[2]
 
 
 def search_in(folder: str | Path) -> None:
-    """Let import paths find modules in this folder too, after all other places."""
+    """Let import paths find modules in this folder too. It is searched after all other folders."""
     folder = str(Path(folder).resolve())
     if folder not in sys.path:
         sys.path.append(folder)
@@ -62,9 +62,10 @@ def load(path: str) -> Any:
 
 @contextmanager
 def users_code(called: Any, problem: type[UserError], hint: str = "") -> Iterator[None]:
-    """Convert an exception of a user's class or function `called` into a `problem` with name, file and line.
+    """Convert an exception of `called`, a user's class or function, into the error `problem` with name, file and line.
 
-    Errors of this package and of its own classes pass unchanged. `hint` is added to the end of the text.
+    An exception passes unchanged if its type or `called` belongs to this package, or if it is a MemoryError. `hint` is
+    added to the end of the text.
     """
     try:
         yield
@@ -82,7 +83,7 @@ def users_code(called: Any, problem: type[UserError], hint: str = "") -> Iterato
 
 
 def origins(paths: Iterable[str]) -> dict[str, dict[str, str | None]]:
-    """Return for each import path the version of its package, if that is installed, and the SHA-256 of its source."""
+    """Return by import path: `version` of its package and `sha256` of its source file, each None if there is none."""
     return {path: {"version": _version(path), "sha256": _source_digest(path)} for path in sorted(set(paths))}
 
 

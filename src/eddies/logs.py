@@ -16,8 +16,8 @@ LEVELS = {"debug": logging.DEBUG, "info": logging.INFO, "outcome": OUTCOME, "war
 
 
 def configure_logging(rank: int, level: str | None = None) -> None:
-    """Send the logger "eddies" to standard output. `level` of rank 0 is debug, info, outcome or warning, by default the
-    value of EDDIES_LOG. Raises UserError if EDDIES_LOG has another value."""
+    """Send the logger "eddies" to standard output. The `level` of rank 0 is debug, info, outcome or warning; by default
+    the value of EDDIES_LOG, or info. Raises UserError if EDDIES_LOG has another value."""
     name = level or os.environ.get("EDDIES_LOG", "info")
     if name not in LEVELS:
         raise UserError(f"EDDIES_LOG = {name}: must be one of {', '.join(LEVELS)}")
@@ -31,13 +31,13 @@ def configure_logging(rank: int, level: str | None = None) -> None:
 class Output:
     """Replaces standard output while a command runs.
 
-    Characters that the encoding lacks are written as "\\u2264". A line that cannot be written, as on a full disk, does
-    not end the run; `end` reports it, unless the reader of a pipe, such as `head`, has closed it.
+    Characters that the encoding lacks are written as escapes such as "\\u2264". A failed write, as on a full disk, does
+    not end the run. `end` reports the failure, unless the reader of a pipe, such as `head`, has closed the pipe.
     """
 
     def __init__(self) -> None:
         for name in ("stdout", "stderr"):
-            if getattr(sys, name) is None:  # closed: otherwise the next open file gets its number
+            if getattr(sys, name) is None:  # closed: the next file opened would get its descriptor
                 setattr(sys, name, open(os.devnull, "w"))
             if hasattr(getattr(sys, name), "reconfigure"):
                 getattr(sys, name).reconfigure(errors="backslashreplace")

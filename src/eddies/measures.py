@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-#: The best value is 0, except 1 for ratios and for the variance of counts.
+#: The best value of a measure is 0; for ratios and for the variance of counts it is 1.
 MEASURES = {
     "velocity_error_early": "velocity error at t_η",
     "velocity_error_half": "velocity error at T/2",
@@ -32,7 +32,7 @@ MEASURES = {
     "count_variance": "variance of counts, over random points",
     "count_variance_floor": "variance of counts of the true tracers",
 }
-#: Measures that are drawn, and measures in the table of variants.
+#: Measures in the figure of variants, and measures in the table of variants.
 DRAWN = ("velocity_error_early", "velocity_error_half", "spectrum_error", "acceleration_kl")
 SHOWN = ("velocity_error_early", "velocity_error_half", "velocity_error_end", "spectrum_error", "energy_ratio",
          "velocity_kl", "velocity_kl_floor", "acceleration_kl", "acceleration_kl_floor", "qr_kl", "qr_kl_floor",

@@ -10,14 +10,14 @@ class Stage:
     Parameters
     ----------
     name : name of the stage and of its command.
-    about : its result, for the help.
+    about : its result in words, for the help of the command.
     section : the section of a scene that asks for the stage; None if the stage is always run.
-    product : kind of its product PRODUCT.h5 in the run directory; None without one.
+    product : kind of its product, the file PRODUCT.h5 in the run directory; None if it has no product.
     reads : sections and properties of a scene on which its product depends, besides those of the stages before it (see
         workflows/run_directory/fingerprints.py).
     depends_on : all stages on which its product depends, if the scene has them.
     checkpoints : directory of its checkpoints in the run directory; None without checkpoints.
-    but : keys "section.key" of sections in `reads` on which its product does not depend.
+    but : keys "section.key", in the sections of `reads`, on which its product does not depend.
     """
 
     name: str

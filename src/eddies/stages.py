@@ -46,17 +46,17 @@ class VariantsFailed(UserError):
 
 def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path, stop: StopRequest,
                overwrite: bool = False, take_over: bool = False, variants: Sequence[str] = ()) -> None:
-    """Run stages of a scene, for all its variants or those named; all ranks call it.
+    """Run stages of a scene, for all its variants or those named in `variants`; all ranks call it.
 
-    A stage is skipped if its product is complete and was made with the same settings. It continues from a checkpoint of
-    the same settings. Work of other settings is replaced only with `overwrite`. The wall time of each stage is recorded
-    in stage_seconds.json. A lock keeps other jobs out of the directory; `take_over` ends the job that holds it. The
-    failure of a variant does not stop the others.
+    A stage is skipped if its product is complete and was made with the same settings. Otherwise it continues from a
+    checkpoint of the same settings, if there is one. Work of other settings is replaced only if `overwrite` is true.
+    The wall time of each stage is recorded in stage_seconds.json. A lock keeps other jobs out of the directory. If
+    `take_over` is true, a job that holds the lock is ended. The failure of a variant does not stop the other variants.
 
     Raises:
         Stopped: `stop` requested it; the running stage has stored what the next run needs.
         SceneError: a file STOP is present at the start, or the scene lacks a section, cannot use as many ranks, makes
-            too large a file for rank 0 to write, or differs from the scene of an input.
+            too large a file for rank 0 to write, or has other settings than an input was made with.
         RunInUse, RunTakenOver: another job works in the directory, or has taken it over.
         WouldReplaceWork: work of other settings would be replaced.
         WriteError: the directory cannot be written.
@@ -90,7 +90,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     made = {file for step in planned for file in step.files}
     for step in planned:
         check_inputs(step, comm, made)
-    if on_first_rank(comm, lambda: os.path.exists(directory / "STOP")):  # ends a chain of jobs that queues itself again
+    if on_first_rank(comm, lambda: os.path.exists(directory / "STOP")):  # ends a chain of jobs that resubmit themselves
         raise SceneError(f"{directory / 'STOP'}: asks the job to stop before it begins; remove the file to continue")
     with working_in(comm, directory, stop, take_over):
         for step in planned:
@@ -108,7 +108,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
 
 def run_steps(planned: Sequence[Step], comm: Comm, directory: Path, stop: StopRequest, overwrite: bool,
               take_over: bool) -> dict[str, str]:
-    """Run the steps of a run directory whose lock is held. Returns the errors of failed variants by name."""
+    """Run the steps of a run directory whose lock is held. Returns the error of each failed variant by name."""
     failures: dict[str, str] = {}
     errors = comm.Dup()  # other ranks may wait in `comm` for a message when one rank fails
     for number, step in enumerate(planned, 1):
@@ -139,7 +139,7 @@ def run_steps(planned: Sequence[Step], comm: Comm, directory: Path, stop: StopRe
 
 
 def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None:
-    """Run the stages of a step that are not done, in its directory, whose lock is held."""
+    """Run those stages of a step that are not done. The lock of its directory is held."""
     scene, directory = step.scene, step.directory
     if step.links:  # the other inputs were checked before the first step
         check_inputs(step, comm)
@@ -166,7 +166,8 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
 
 
 def checked_work(step: Step, comm: Comm, overwrite: bool) -> Work:
-    """Examine the directory of a step. Raises WouldReplaceWork if work would be replaced without `overwrite`."""
+    """Return the work in the directory of a step. Raises WouldReplaceWork if it would be replaced and `overwrite` is
+    false."""
     work = in_files(comm, step.directory, lambda: find_work(
         [*step.links, *step.stages], step.scene, step.directory, step.links))
     if not overwrite:
@@ -183,12 +184,12 @@ def working_in(comm: Comm, directory: Path, stop: StopRequest, take_over: bool) 
 
 def run_stage(name: str, arguments: Sequence[Any], comm: Comm, directory: Path, stop: StopRequest,
               begun: bool) -> None:
-    """Run one stage with its arguments and record its wall time, also if it is stopped. If it had `begun` before, its
-    times are added."""
+    """Run one stage with its arguments and record its wall time, also if it is stopped. If `begun` is true,
+    the time of earlier runs is added (`record_seconds`)."""
     log.info("%s: starts on %d %s", name, comm.size, "rank" if comm.size == 1 else "ranks")
     start = time.perf_counter()
     of_tracks = name == "dns" and arguments[0].tracks is not None
-    # run(directory, comm, variants, stop) of the report, run(scene, comm, directory, stop) of the others
+    # The report has run(directory, comm, variants, stop), the other stages have run(scene, comm, directory, stop).
     run = import_module(f"eddies.workflows.{'tracks' if of_tracks else name.replace('-', '_')}").run
     stop.check()
     try:
@@ -202,7 +203,7 @@ def run_stage(name: str, arguments: Sequence[Any], comm: Comm, directory: Path, 
 
 
 def check_inputs(step: Step, comm: Comm, made: Collection[Path] = ()) -> None:
-    """Raise SceneError or ProductError if an input of a step is missing, not usable or of other settings.
+    """Raise SceneError or ProductError if an input of a step is missing, unusable or made with other settings.
 
     Files in `made`, which the same job makes first, are not checked.
     """
@@ -235,8 +236,8 @@ def prepare_directory(text: str, comm: Comm, directory: Path) -> None:
 
 
 def record_seconds(stage: str, seconds: float, comm: Comm, directory: Path, begun: bool) -> float:
-    """Record the wall time of a stage in stage_seconds.json and return it. If the stage had `begun` before, the time of
-    its earlier runs is added, except of those that were killed."""
+    """Record the wall time of a stage in stage_seconds.json and return it. If `begun` is true, the time of
+    earlier runs that began the stage is added, but not that of killed runs."""
     path = directory / SECONDS
 
     def record() -> float:

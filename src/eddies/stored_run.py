@@ -102,7 +102,7 @@ class StoredRun:
 
     @property
     def metrics(self) -> dict[str, Any]:
-        """The numbers of the report by section."""
+        """The numbers of the report, by section and name. Warns if a product is newer than the report."""
         path = self.path / "report" / "metrics.json"
         if not path.is_file():
             raise UserError(f"{path}: no such file; run `eddies report {self.path}` first")
@@ -115,10 +115,10 @@ class StoredRun:
         return read_metrics(path)
 
     def trajectories(self, ids: Any = None, of: str = "model", unwrapped: bool = False) -> Any:
-        """Position, velocity and other columns of all particles or those with these ids.
+        """Position, velocity and other columns of all particles, or of those with the given `ids`.
 
-        `of` is "model" or "truth" for the rollout, or "tracers" for the ground truth. With `unwrapped`
-        positions are continuous beyond the periodic cube.
+        `of` is "model" or "truth" for the rollout, or "tracers" for the ground truth. If `unwrapped` is true, positions
+        are continuous beyond the periodic cube.
         """
         found = self[chosen(TRAJECTORIES, of)]
         if ids is not None and not isinstance(ids, slice):
@@ -142,7 +142,7 @@ class StoredRun:
         return found
 
     def field(self, name: str = "velocity", time: float | None = None, of: str = "filtered") -> Any:
-        """A field on its grid, (component, z, y, x), at the stored time nearest to `time`; None for the last one.
+        """A field on its grid, (component, z, y, x), at the stored time nearest to `time`, by default the last one.
 
         `of` is "filtered" or "unfiltered" for the flow, "final" for a run without tracers, "reconstructed" for the
         fields of [reconstruction], or "model" or "truth" for the field that the kernel makes from the particles.
@@ -150,10 +150,10 @@ class StoredRun:
         return at_time(self[chosen(FIELDS, of)], name, time)
 
     def spectrum(self, of: str = "model", time: float | None = None) -> Any:
-        """Energy spectrum at the stored time nearest to `time`; None for the last one.
+        """Energy spectrum at the stored time nearest to `time`, by default the last one.
 
-        `of` is "flow" or "filtered", or "model" or "truth" for the spectrum of a least-squares fit to the velocities of
-        the particles.
+        `of` is "flow" for the unfiltered flow, "filtered" for the filtered one, or "model" or "truth" for a
+        least-squares fit to the velocities of the particles.
         """
         group, column = chosen(SPECTRA, of)
         return at_time(self[group], column, time)
@@ -189,7 +189,7 @@ def variant_directory(path: Path, name: str) -> Path:
 
 
 def chosen(table: dict[str, Any], of: str) -> Any:
-    """The entry of a name. Raises UserError, with the valid names, for another name."""
+    """The entry `of` of a table. Raises UserError, which gives the valid names, if there is no such entry."""
     if of not in table:
         raise UserError(f'of = "{of}": must be one of {", ".join(table)}')
     return table[of]
@@ -203,8 +203,8 @@ def check_ids(ids: np.ndarray, count: int) -> None:
 
 
 def at_time(found: Any, name: str, time: float | None) -> Any:
-    """A variable at the stored time nearest to `time`; None for the last one. Raises UserError for an unknown variable,
-    and for a time outside the stored times by more than their longest interval."""
+    """A variable at the stored time nearest to `time`, or at the last stored time if `time` is None. Raises UserError
+    for an unknown variable, and for a time outside the stored times by more than their longest interval."""
     if name not in found or name == "time":
         raise UserError(f'"{name}": no such variable; there are {", ".join(key for key in found if key != "time")}')
     times = np.asarray(found["time"])

@@ -42,9 +42,9 @@ def _phi_closed_form(order: int, z: np.ndarray) -> np.ndarray:
 
 
 def divided_difference(function: ScalarFunction, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """f[z1, z2] = (f(z1) - f(z2)) / (z1 - z2), and its limit f'(z) where the arguments meet; f entire.
+    """f[z1, z2] = (f(z1) - f(z2)) / (z1 - z2), and its limit f'(z) where z1 = z2 = z; f must be entire.
 
-    Close arguments use Cauchy's formula on the unit circle around their mean.
+    If the arguments are close, Cauchy's formula is used, on the unit circle around their mean.
     """
     first, second = np.asarray(first, complex), np.asarray(second, complex)
     close = np.abs(first - second) < _CANCELLATION_RADIUS
@@ -71,7 +71,7 @@ class ETDRK4:
         self._operators: dict[float, list[Any]] = {}
 
     def __call__(self, state: np.ndarray, step: float) -> np.ndarray:
-        """The state one `step` later."""
+        """The state after one step of size `step`."""
         full, half, q, f1, f2, f3 = self._operators.get(step) or self._prepare(step)
         N, combine = self.equation.nonlinear, self.equation.combine
         n0 = N(state)
@@ -106,7 +106,7 @@ class RungeKutta4:
         self.equation = equation
 
     def __call__(self, state: np.ndarray, step: float) -> np.ndarray:
-        """The state one `step` later."""
+        """The state after one step of size `step`."""
         k1 = self._rate(state)
         k2 = self._rate(state + step / 2 * k1)
         k3 = self._rate(state + step / 2 * k2)

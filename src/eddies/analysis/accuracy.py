@@ -13,12 +13,12 @@ from eddies.measures import MEASURES
 
 
 def accuracy(run: Rollout) -> dict[str, float | None]:
-    """All MEASURES, and `end`, the last common time divided by T. A measure is None if rollout or truth does not reach
-    its time.
+    """Measures of a rollout, by the keys of MEASURES, and `end`, the last common time divided by the turnover time T.
 
-    Velocity errors are normalised L2 norms of the differences by particle, interpolated linearly between frames.
-    Measures at the end are taken at the last common frame, and Lagrangian statistics over all common frames. Both
-    groups are None for a rollout that is not complete, because it ends earlier than others.
+    A measure is None if the rollout or the truth does not reach its time. Velocity errors are normalised L2 errors over
+    all particles; those at t_eta and T/2 are interpolated linearly between frames. Measures at the end are taken at the
+    last common frame, and Lagrangian statistics over all common frames. Both groups are None for a rollout that stops
+    early or has a frame that is not finite, because it ends earlier than the rollouts it is compared with.
     """
     measures: dict[str, float | None] = dict.fromkeys(MEASURES)
     try:

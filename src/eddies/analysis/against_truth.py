@@ -20,7 +20,7 @@ def mean_energy(frames: Frames, frame: int) -> float:
 
 
 def particle_series(frames: Frames, chosen: Sequence[int]) -> dict[str, np.ndarray]:
-    """Columns over chosen frames: time, energy <v.v>/2, and density_rms if a density is stored."""
+    """Time series over chosen frames, by name: time, energy <v.v>/2, and density_rms if a density is stored."""
     columns = {"time": frames.times[np.asarray(chosen)],
                "energy": np.array([mean_energy(frames, frame) for frame in chosen])}
     if "density" in frames.columns:
@@ -29,9 +29,10 @@ def particle_series(frames: Frames, chosen: Sequence[int]) -> dict[str, np.ndarr
 
 
 def error_series(run: Rollout) -> dict[str, np.ndarray]:
-    """Columns over the common frames: time, velocity_error (normalised L2), velocity_kl, acceleration_kl, no_force.
+    """Time series over the common frames, by name: time, velocity_error, velocity_kl, acceleration_kl, no_force.
 
-    `no_force` is the velocity error of particles that keep their velocity at the first common frame.
+    `velocity_error` is the normalised L2 error. `no_force` is this error for particles that keep the true velocity of
+    the first common frame.
     """
     rows, first = [], run.pair(0, "velocity").truth
     for index in range(run.common.times.size):
@@ -44,16 +45,16 @@ def error_series(run: Rollout) -> dict[str, np.ndarray]:
 
 
 def pdf_divergence(pair: Pair, edges: np.ndarray) -> float:
-    """Forward KL divergence of the PDFs of truth and model, with all components in one PDF; both are standardised by
-    the mean and deviation of the truth."""
+    """Forward KL divergence between the PDFs of truth and model, each PDF over all components. Both are standardised
+    with the mean and the standard deviation of the truth."""
     return kl_divergence(bin_probabilities(standardized(pair.truth), edges),
                          bin_probabilities(standardized(pair.model, pair.truth), edges))
 
 
 def sampling_floor(pair: Pair, edges: np.ndarray) -> float:
-    """Expected divergence of this PDF between two independent samples of the truth.
+    """Expected divergence between the PDFs of two independent samples of the truth.
 
-    A model whose particles are still near the true ones can have a smaller divergence.
+    The divergence of a model can be below this floor while its particles are still near the true ones.
     """
     values = standardized(pair.truth)
     return sampling_divergence(len(values), lambda rows: bin_probabilities(values[rows], edges))
@@ -70,7 +71,7 @@ class InvariantStatistics:
 
     @classmethod
     def of(cls, model: Invariants, truth: Invariants) -> "InvariantStatistics":
-        """Joint PDFs of (Q, R), both in units of the truth's <Q_w>, so that a wrong amplitude of the model shows."""
+        """Joint PDFs of (Q, R). The truth's <Q_w> is the unit of both, so that a wrong amplitude of the model shows."""
         model_plane, truth_plane = (run.normalized(truth.scale) for run in (model, truth))
         bins = InvariantBins.covering(*truth_plane)
         floor = sampling_divergence(len(truth.second),
@@ -91,7 +92,7 @@ def last_invariants(run: Rollout) -> InvariantStatistics:
 def conditional_flows(run: Rollout, bins: InvariantBins) -> tuple[ConditionalVelocity, ConditionalVelocity] | None:
     """Conditional mean (dQ/dt, dR/dt) of model and truth over all common frames; None with fewer than two frames.
 
-    Q, R and their rates are in units of the truth's <Q_w> at the time.
+    The units of Q, R and their rates are powers of the truth's <Q_w>, averaged over the two frames of a difference.
     """
     times = run.common.times
     if times.size < 2:

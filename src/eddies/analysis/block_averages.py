@@ -13,7 +13,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its standard error; NaN if there are too few blocks."""
+    """A number and its standard error. The error is NaN if there are too few blocks."""
 
     value: float
     error: float
@@ -26,14 +26,17 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Blocks:
-    """Equal spans of time: sample times (n,), and the indices of the samples in each block."""
+    """Blocks of equal duration: `times` (n,) of all samples; `members` has the row numbers of each block's samples."""
 
     times: np.ndarray
     members: Sequence[np.ndarray]
 
     @classmethod
     def of(cls, times: np.ndarray, shortest: float) -> "Blocks":
-        """As many equal blocks as possible, each at least `shortest` long; at least one. Empty blocks are left out."""
+        """Divide the span of `times` into as many equal blocks as possible, each of duration `shortest` or more.
+
+        A span shorter than `shortest` is one block. Blocks without samples are left out.
+        """
         span = float(times[-1] - times[0])
         count = max(min(int(span / shortest + 1e-9), len(times)), 1)
         block = ((times - times[0]) * (count / max(span, 1e-300)) + 1e-9).astype(int).clip(max=count - 1)
@@ -45,7 +48,7 @@ class Blocks:
         return np.array([samples[rows].mean(axis=0) for rows in self.members])
 
     def mean(self, samples: np.ndarray) -> Estimate:
-        """Mean of samples (n,) over blocks; error: standard deviation of the block means divided by sqrt(blocks)."""
+        """Mean of the block means of samples (n,); the error is their standard deviation divided by sqrt(blocks)."""
         return self.of_mean(samples, float)
 
     def of_mean(self, samples: np.ndarray, function: Callable[[np.ndarray], float]) -> Estimate:
@@ -58,7 +61,10 @@ class Blocks:
         return Estimate(value, float(np.sqrt((count - 1) * np.var(without))))
 
     def trend(self, samples: np.ndarray) -> Estimate:
-        """Slope of the regression line of samples (n,) over time. The error, from block residuals, needs 3 blocks."""
+        """Slope of the regression line of samples (n,) over time, with its error from the block means of the residuals.
+
+        The error is NaN for fewer than 3 blocks.
+        """
         offsets, deviations = self.times - self.times.mean(), samples - samples.mean()
         slope = float(np.sum(offsets * deviations) / np.sum(offsets**2)) if offsets.any() else np.nan
         times, residuals = self.means(offsets), self.means(deviations - slope * offsets)

@@ -1,6 +1,7 @@
-"""Order and conservation of particles: their distances and counts, and the drift of their momentum and mean density.
+"""Disorder and conservation: distances and counts of particles, and drifts of their momentum and mean density.
 
-Random particles that follow a solenoidal flow stay random. The particles of a model may cluster, line up or shake.
+Randomly placed particles that follow a solenoidal flow stay randomly placed. Those of a model may cluster, line up or
+oscillate.
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from eddies.analysis.rollout import Frames, Rollout
 # Bins of the PDF of nearest-neighbour distances, in mean spacings; a share exp(-14) of random points lies beyond.
 DISTANCE_EDGES = np.linspace(0, 1.5, 31)
 SAMPLED = 2**15  # largest number of particles whose nearest neighbour is searched
-PAIRS = 2**22  # about the largest number of pairs in a list, if particles have gathered
+PAIRS = 2**22  # about the largest number of pairs found in one search, if particles have clustered
 CELL = 2.0  # side of the cells in which particles are counted, in mean spacings: about a filter width
 
 
@@ -53,8 +54,9 @@ def random_distance_density(distance: np.ndarray) -> np.ndarray:
 def count_variance(position: np.ndarray, length: float) -> float:
     """Variance of the counts of particles (n, 3) in cells of side CELL mean spacings, divided by that of random points.
 
-    Counts of random points are multinomial: their variance is the mean times 1 - 1/cells. So 0 means a lattice, 1
-    (to within sqrt(2 / cells)) random points, and more than 1 clusters. NaN for fewer than two cells along a side.
+    Counts of random points are multinomial: their variance is the mean times 1 - 1/cells. So the result is 0 for a
+    lattice, 1 to within sqrt(2 / cells) for random points, and above 1 for clusters. It is NaN for fewer than two
+    cells along a side.
     """
     side = round(len(position) ** (1 / 3) / CELL)
     if side < 2:
@@ -70,7 +72,7 @@ def _counts(position: np.ndarray, length: float, side: int) -> np.ndarray:
 
 
 def count_variance_series(frames: Frames, chosen: Sequence[int], length: float) -> dict[str, np.ndarray]:
-    """Columns time and count_variance over chosen frames."""
+    """Time series over chosen frames, by name: time and count_variance."""
     return {"time": frames.times[np.asarray(chosen)],
             "count_variance": np.array([count_variance(frames.read(int(frame), "position"), length)
                                         for frame in chosen])}
@@ -79,7 +81,7 @@ def count_variance_series(frames: Frames, chosen: Sequence[int], length: float) 
 def momentum_drift(start: np.ndarray, end: np.ndarray) -> float:
     """|<v(end)> - <v(start)>| / u' of velocities (n, 3), u' the rms of a component about its mean at the start.
 
-    Tracers of a flow that keeps its momentum have a drift of order n^(-1/2), because they are a sample.
+    Tracers of a flow that keeps its momentum have a drift of order n^(-1/2), because they sample the flow at n points.
     """
     start, end = (velocity.astype(float) for velocity in (start, end))
     return float(np.linalg.norm(end.mean(0) - start.mean(0)) / np.std(start - start.mean(0)))
@@ -92,9 +94,10 @@ def mean_drift(start: np.ndarray, end: np.ndarray) -> float:
 
 
 def drifts(run: Rollout) -> dict[str, dict[str, float]]:
-    """Drifts from the first to the last common time, and the count variance at the last; each for "model" and "truth".
+    """Drifts from the first to the last common time, and the count variance at the last time.
 
-    Names are `momentum_drift`, `count_variance` and, for a model that integrates a density, `density_drift`.
+    Returns for each name the values of "model" and "truth". Names are `momentum_drift`, `count_variance` and, for a
+    model that integrates a density, `density_drift`.
     """
     columns = {"momentum_drift": ("velocity", momentum_drift)}
     if run.attributes.get("integrates_density", False):

@@ -18,9 +18,10 @@ def normalized_l2(prediction: np.ndarray, truth: np.ndarray) -> float:
 
 
 def rms_log_ratio(prediction: np.ndarray, truth: np.ndarray) -> float:
-    """Root mean square of ln(prediction / truth) over all entries: a if every entry is wrong by a factor e^a or e^-a.
+    """Root mean square of ln(prediction / truth) over all entries.
 
-    Not finite if an entry is not positive, NaN without entries.
+    It is a if every prediction is wrong by a factor e^a or e^-a, not finite if an entry is not positive, and NaN
+    without entries.
     """
     prediction, truth = np.asarray(prediction, dtype=float), np.asarray(truth, dtype=float)
     if prediction.size == 0:

@@ -21,7 +21,7 @@ COMPONENTS = ("energy_x", "energy_y", "energy_z")
 def gradient_skewness(reynolds_lambda: float) -> float:
     """Skewness of the longitudinal gradient, -0.32 Re_lambda^0.11 (Ishihara et al., J. Fluid Mech. 592, 335, 2007).
 
-    A fit at Re_lambda > 200. Simulations at 30 to 100 find -0.45 to -0.55.
+    A fit at Re_lambda > 200. Simulations at Re_lambda = 30 to 100 find -0.45 to -0.55.
     """
     return -0.32 * reynolds_lambda**0.11
 
@@ -48,7 +48,7 @@ def acceleration_constant(reynolds_lambda: float) -> float:
 
 
 def modes_per_shell(largest: int) -> np.ndarray:
-    """Number of wavevectors with integer components whose length rounds to 0, 1, ... largest: (largest + 1,)."""
+    """Number of integer wavevectors whose length rounds to 0, 1, ..., largest: (largest + 1,)."""
     k = np.arange(largest + 1)
     twins = np.where(k == 0, 1, 2)  # k and -k
     squared, weights = np.add.outer(k**2, k**2), np.multiply.outer(twins, twins).ravel()
@@ -148,8 +148,8 @@ class StationarySpan:
     def compensated_spectrum(self) -> tuple[np.ndarray, np.ndarray]:
         """k eta and eps^(-2/3) k^(5/3) E(k) of the mean spectrum, for k = 1 to the last complete shell.
 
-        The lattice fills its shells unevenly (k = 1: 18 modes on 4 pi k^2 = 12.6). So E(k) is the mean energy of the
-        shell's modes times 4 pi k^2.
+        The number of modes in a shell differs from 4 pi k^2: at k = 1 it is 18 instead of 12.6. So E(k) is here the
+        mean energy of a mode of the shell times 4 pi k^2.
         """
         cutoff = int(np.rint(self.columns["kmax_eta"][-1] / self.columns["kolmogorov_length"][-1]))
         k = np.arange(1, cutoff + 1)
@@ -216,7 +216,7 @@ def comparison(span: StationarySpan) -> list[Row]:
 
 
 def _spectrum_rows(span: StationarySpan) -> list[Row]:
-    """Rows of the mean and the maximum of the compensated spectrum, if the flow has shells in their ranges."""
+    """Rows for mean and maximum of the compensated spectrum, each only if shells lie in its range of k eta."""
     k_eta, compensated = span.unforced()
     inertial = compensated[(k_eta >= INERTIAL[0]) & (k_eta <= INERTIAL[1])]
     constant = "{}–{}, more in a bottleneck".format(*KOLMOGOROV_CONSTANT)

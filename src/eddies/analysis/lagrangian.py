@@ -1,4 +1,4 @@
-"""Lagrangian statistics of particles: memory, accelerations, and dispersion.
+"""Lagrangian statistics of particles: increments and correlations of velocity, accelerations, and dispersion.
 
 Model and truth are measured over the same frames, with the same particles.
 """
@@ -13,7 +13,7 @@ from eddies.analysis.rollout import CommonFrames, Frames
 from eddies.kernels.library import library
 from eddies.kernels.neighbors import Box, neighbors_within
 
-VALUES = 2**22  # about the largest number of values of a column in memory at once, over all frames
+VALUES = 2**22  # about the largest number of values of a column in memory at once, all frames together
 LAGS = 18       # largest number of lags
 TETRADS = 1000  # particles around which pairs and tetrads are followed
 CORNERS = 4
@@ -68,13 +68,13 @@ def lags_of(longest: int) -> np.ndarray:
 
 
 def near_tetrads(position: np.ndarray, length: float) -> np.ndarray:
-    """Rows (4, m) of at most TETRADS evenly chosen particles (n, 3) and of their three nearest neighbours."""
+    """Tetrads as rows (4, m) of positions (n, 3): at most TETRADS particles, each with its three nearest neighbours."""
     chosen = evenly(len(position), TETRADS)
     return np.concatenate([chosen[None], nearest_rows(position, length, chosen, CORNERS - 1)])
 
 
 def path_statistics(run: Frames, chosen: Sequence[int], tetrads: np.ndarray, length: float) -> PathStatistics:
-    """Statistics of the chosen frames of a run; `tetrads` are rows (4, g) of its particles."""
+    """Statistics of the chosen frames of a run; `tetrads` (4, g) are rows of the run's particles."""
     chosen = [int(frame) for frame in chosen]
     times = run.times[chosen] - run.times[chosen[0]]
     velocity, acceleration = (_sample(run, chosen, column) for column in ("velocity", "acceleration"))
@@ -109,14 +109,14 @@ def differences(model: PathStatistics, truth: PathStatistics) -> dict[str, float
 
 
 def _sample(run: Frames, chosen: Sequence[int], column: str) -> np.ndarray:
-    """A column of vectors (m, n, 3) of evenly chosen particles."""
+    """A column of vectors in the chosen frames, (m, n, 3), for evenly chosen particles; at most about VALUES values."""
     every = -(-run.read(chosen[0], column).size * len(chosen) // VALUES)
     return np.stack([run.read(frame, column)[::every] for frame in chosen])
 
 
 def _dispersion(run: Frames, chosen: Sequence[int], tetrads: np.ndarray,
                 length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Dispersion of the pairs of the first two corners, size and shape of the tetrads, over the frames."""
+    """Dispersion (m,) of pairs of the first two corners, size (m,) and shape (m, 3) of tetrads, in chosen frames."""
     first = np.tile(tetrads[0], CORNERS - 1)
     paths = separations((run.read(frame, "position") for frame in chosen), tetrads[1:].ravel(), first, length)
     pairs, sizes, shapes, start = [], [], [], None
@@ -142,7 +142,7 @@ def tetrad_moments(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def correlation(initial: np.ndarray, later: np.ndarray) -> float:
-    """<v(0).v(t)> / sqrt(<v(0)^2> <v(t)^2>) of the same particles (n, 3) at two times; NaN at rest."""
+    """<v(0).v(t)> / sqrt(<v(0)^2> <v(t)^2>) of the same particles (n, 3) at two times; NaN if v(0) or v(t) = 0."""
     with np.errstate(invalid="ignore"):
         return float(np.sum(initial * later) / np.sqrt(np.sum(initial**2) * np.sum(later**2)))
 
@@ -186,8 +186,8 @@ def separations(position: Iterable[np.ndarray], first: np.ndarray, second: np.nd
                 length: float) -> Iterator[np.ndarray]:
     """Separations x_first - x_second (m, 3) of pairs, frame by frame, from positions (n, 3) of each frame.
 
-    Positions may be wrapped into the box. Separations start at the nearest image and are continuous, if none changes by
-    more than length / 2 between two frames. `first` and `second` (m,) are rows.
+    Positions may be wrapped into the box. The first separation is to the nearest image. Later ones are continuous if no
+    component changes by more than length / 2 between frames. `first` and `second` (m,) are rows of the positions.
     """
     separation = 0.0
     for frame in position:
@@ -212,9 +212,10 @@ def pair_dispersion(position: Iterable[np.ndarray], groups: Sequence[np.ndarray]
 
 def neighbor_pairs(position: np.ndarray, length: float, chosen: np.ndarray,
                    radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The other rows of positions (n, 3) within a radius of each of the chosen rows (m,), periodic with `length`.
+    """Pairs of a chosen particle and another particle within a radius of it, periodic with `length`.
 
-    Returns for each pair the place in `chosen`, the other row and the distance. Places are in ascending order.
+    `chosen` (m,) are rows of positions (n, 3). Returns for each pair the first particle's index in `chosen`, the row of
+    the other particle, and their distance. The indices are in ascending order.
     """
     offsets, rows = neighbors_within(library(), Box(length, True), radius, position[chosen], position, False)
     places = np.repeat(np.arange(chosen.size), np.diff(offsets))
@@ -226,7 +227,7 @@ def neighbor_pairs(position: np.ndarray, length: float, chosen: np.ndarray,
 
 def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], tolerance: float,
              followed: int) -> list[np.ndarray]:
-    """Rows (2, m) of the pairs at each of the distances, within a relative `tolerance`, among particles (n, 3).
+    """For each distance, rows (2, m) of the pairs of particles (n, 3) at this distance, to a relative `tolerance`.
 
     The first particle of a pair is one of the first `followed` rows. Each pair appears once.
     """

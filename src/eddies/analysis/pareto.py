@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-Method = Mapping[str, Any]  # `label`; a cost and errors by KEY, None if unknown; their deviations, KEY_spread
+Method = Mapping[str, Any]  # `label`; cost and errors, None if unknown; KEY_spread, standard deviation of error KEY
 
 
 def pareto_front(cost: np.ndarray, error: np.ndarray) -> np.ndarray:
@@ -26,15 +26,16 @@ def pareto_front(cost: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 
 def verdict(model: Method, others: Sequence[Method], cost: str, measures: Mapping[str, str]) -> list[str]:
-    """Two texts: the measures in which a method is worth its cost, and the rivals in the other measures.
+    """Two texts: the measures in which the model is worth its cost, and its rivals in the other measures.
 
-    A rival is another method that costs no more and is as accurate. A method is worth its cost if it has no rival.
-    Errors that differ by less than the larger spread over realisations are equal. A method without a number is not
-    a rival. For each measure, the text names the cheapest rival and the number of the others.
+    The model is worth its cost in a measure without a rival. A rival is another method that costs no more and is at
+    least as accurate. Errors count as equal if they differ by at most the larger of their spreads over realisations.
+    A method that lacks the cost or the error is no rival. For each measure, the text names the cheapest rival and the
+    number of further ones. Without other methods, there is one text that says so.
 
     Parameters
     ----------
-    cost : key of the cost. measures : keys of the errors, with their names in words.
+    cost : key of the cost. measures : names of the errors in words, by key.
     """
     if not others:
         return ["No other method was run."]
@@ -75,9 +76,9 @@ def cheapest_grid(model: Method, grids: Sequence[Method], cost: str, times: Mapp
 
 
 def break_even(first: float, each: float, rival_first: float, rival_each: float) -> float:
-    """Turnovers after which a method has taken less time than a rival; infinite if its turnovers are not faster.
+    """Number of turnovers until a method has taken less time than a rival; infinite if its turnovers are not faster.
 
-    `first` is the time in seconds before the first turnover, `each` the time of one turnover.
+    `first` is the method's time in seconds before its first turnover, `each` its time for one turnover.
     """
     if each >= rival_each:
         return math.inf
@@ -85,6 +86,6 @@ def break_even(first: float, each: float, rival_first: float, rival_each: float)
 
 
 def _worse(row: Method, model: Method, key: str) -> bool:
-    """Whether the error of a row is larger than the model's by more than both spreads."""
+    """Whether the error of a row is larger than the model's by more than the larger spread."""
     spread = max(one.get(f"{key}_spread") or 0.0 for one in (row, model))
     return row[key] > model[key] + spread

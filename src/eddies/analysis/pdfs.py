@@ -1,4 +1,4 @@
-"""Histogram PDFs that keep their mass, and the divergence between two of them."""
+"""Histogram PDFs that count every value, and the divergence between two of them."""
 
 from collections.abc import Callable
 
@@ -44,7 +44,7 @@ def kl_divergence(truth: np.ndarray, prediction: np.ndarray) -> float:
 def sampling_divergence(rows: int, probabilities: Callable[[np.ndarray], np.ndarray]) -> float:
     """Expected divergence between two independent samples of `rows` rows: the value of a perfect model.
 
-    It is half the divergence between two random halves of the sample, because a divergence decreases as 1 / rows.
+    It is estimated as half the divergence between two random halves of the sample, as it decreases as 1 / rows.
     `probabilities` returns the bin probabilities of chosen rows.
     """
     shuffled = np.random.default_rng(0).permutation(rows)

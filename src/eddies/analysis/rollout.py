@@ -12,7 +12,7 @@ from eddies.analysis.velocity_gradients import Invariants
 
 SHOWN = 3   # largest number of times at which a report shows spectra of a rollout
 PLANES = 4  # largest number of times at which a report shows planes of a rollout
-Table = Mapping[str, np.ndarray]  # columns wavenumber (shells,), time (m,), energy or others (m, shells)
+Table = Mapping[str, np.ndarray]  # columns by name; of spectra: wavenumber (shells,), time (m,), energy (m, shells)
 
 
 class Frames(Protocol):
@@ -29,7 +29,7 @@ class Frames(Protocol):
 
 @dataclass(frozen=True)
 class CommonFrames:
-    """Frames of model and truth at the same times: indices and times, all (m,)."""
+    """Frames of model and truth at the same times: frame numbers of both, and the times, each (m,)."""
 
     model: np.ndarray
     truth: np.ndarray
@@ -61,8 +61,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Plane:
-    """Velocity (3, n, n) and vorticity magnitude (n, n), [y, x], in the plane z = pi, reconstructed from particles.
-    """
+    """Velocity (3, n, n) and vorticity magnitude (n, n), as [y, x], in the plane z = pi, from particles."""
 
     velocity: np.ndarray
     vorticity: np.ndarray
@@ -98,13 +97,13 @@ class SpectraAt:
 
 @dataclass(frozen=True)
 class Rollout:
-    """A rollout, the true particles, and measures of both; read frame by frame.
+    """A rollout, the true particles, and measures of both, which are read frame by frame.
 
     Parameters
     ----------
-    attributes : attributes of the group `rollout` of the product.
-    model, truth : particles, at times since the start of the rollout. The truth may end earlier. Without a ground truth
-        it has no frames, and `without_truth` gives the reason.
+    attributes : attributes of the group `rollout` in rollout.h5.
+    model, truth : particles, at times since the start of the rollout. The truth may end before the model. Without a
+        ground truth, `truth` has no frames, and `without_truth` gives the reason.
     length : edge of the box.
     flow : table `spectra` of the ground truth, with `energy` and `filtered`. Its times and `start_time` count from the
         release of the tracers.
@@ -113,9 +112,10 @@ class Rollout:
     invariants : for "model" and "truth", the invariants of velocity gradients at the particles, by frame. None
         without a kernel, which reconstructs the gradients.
     planes : for "model" and "truth", a plane of the reconstructed field, by frame. None without a kernel.
-    outside_training : share of the pairs outside the training range, (frames,); None if it was not counted.
+    outside_training : share of particle pairs with a network input outside its range in training, (frames,); None if
+        it was not counted.
     closure : columns (frames,) about the solves for the resolved velocity; None if there were none.
-    reconstructed_by : the form of the reconstructions in words.
+    reconstructed_by : name of the reconstruction method, for captions.
     """
 
     attributes: Mapping[str, float | str]
@@ -139,7 +139,7 @@ class Rollout:
 
     @property
     def start_time(self) -> float:
-        """Start of the rollout, since the release of the tracers."""
+        """Time from the release of the tracers to the start of the rollout."""
         return float(self.attributes["start_time"])
 
     @property
@@ -177,13 +177,13 @@ class Rollout:
 
     @cached_property
     def common(self) -> CommonFrames:
-        """The common frames before the model broke. Raises ValueError, with the reason, if there are none."""
+        """The common frames before the time `broken`. Raises ValueError, with the reason, if there are none."""
         if not len(self.truth.times) and self.without_truth:
             raise ValueError(self.without_truth)
         return CommonFrames.of(self.model, self.truth, self.broken)
 
     def before_broken(self, of: str) -> np.ndarray:
-        """The frames of "model" or "truth" before the model broke."""
+        """Frame numbers of "model" or "truth" before the time `broken` of the model."""
         return np.flatnonzero(getattr(self, of).times < self.broken)
 
     def pair(self, index: int, column: str) -> Pair:
@@ -193,25 +193,25 @@ class Rollout:
                     self.truth.read(int(common.truth[index]), column))
 
     def both(self, measures: Mapping[str, Mapping[int, Any]], index: int) -> tuple[Any, Any]:
-        """Values of `measures`, such as `invariants` or `spectra`, of model and truth at a common frame."""
+        """The model's and the truth's value in `measures`, such as `spectra`, at the common frame `index`."""
         return measures["model"][int(self.common.model[index])], measures["truth"][int(self.common.truth[index])]
 
     @property
     def late(self) -> np.ndarray:
-        """The frames of the model in the second half of the time before it broke."""
+        """Frame numbers of the model in the second half of the time before `broken`."""
         frames = self.before_broken("model")
         return frames[self.model.times[frames] >= self.model.times[frames[-1]] / 2]
 
     def spectral(self) -> np.ndarray:
-        """The common frames at which the spectrum of the flow is stored."""
+        """Indices of the common frames at which the spectrum of the flow is stored."""
         return np.flatnonzero(self._has_flow(self.common.times))
 
     def shown_spectra(self, several: bool = True) -> np.ndarray:
-        """A few frames of `spectral`, evenly spread; only the last one unless `several`."""
+        """At most SHOWN frames of `spectral`, evenly spread. If `several` is False, only the last one."""
         return _spread(self.spectral(), SHOWN) if several else self.spectral()[-1:]
 
     def late_spectra(self) -> np.ndarray:
-        """Frames of the model over which its spectrum is averaged, in the second half before it broke.
+        """Frame numbers of the model over which its spectrum is averaged, in the second half before `broken`.
 
         A frame is used if the spectrum of the flow is stored at its time, or if the truth has no frame at this time.
         If the second half has no such frame, the last such frame before it is used.
@@ -222,7 +222,7 @@ class Rollout:
         return frames[second_half(times[frames], float(times[self.before_broken("model")[-1]]))]
 
     def spectra_at(self, index: int) -> SpectraAt:
-        """Spectra at a common frame, in the shells that all have.
+        """Spectra at a common frame, in the shells that all three spectra have.
 
         The spectrum of the filtered flow is the one at the nearest stored time.
         """

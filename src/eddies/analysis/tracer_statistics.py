@@ -1,6 +1,6 @@
 """Statistics of the tracers of a ground truth: energy, acceleration, Lagrangian structure function, pair dispersion.
 
-Tracers follow the filtered flow: its eddies set their accelerations and small-scale separations.
+Tracers follow the filtered flow. So the filtered eddies set the accelerations and the small-scale separations.
 """
 
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ EDGES = bin_edges(12, 120)  # bins of the PDF of accelerations, in standard devi
 
 @dataclass(frozen=True)
 class Dispersion:
-    """The number of `pairs` that start `distance` apart, and two means over them.
+    """Means over the tracer pairs with the initial distance `distance`; `pairs` is their number.
 
     `spread` is <|r(t) - r(0)|^2>, (frames,). `structure` is <|v_1 - v_2|^2> at the start.
     """
@@ -40,11 +40,11 @@ class TracerStatistics:
     ----------
     energy_ratio : <v.v> of the tracers divided by <v.v> of the filtered field, at `field_times`, (fields,).
     energy_error : standard deviation of this ratio for the same number of random points, (fields,).
-    probability : PDF (bins,) on EDGES of an acceleration component in units of its rms at the time, from differences of
-        successive frames.
+    probability : PDF of an acceleration component divided by its rms at the same time, in the bins EDGES, (bins,).
+        Accelerations are velocity differences of successive frames.
     kurtosis : kurtosis of this PDF; 3 if it is Gaussian.
     acceleration_rms : rms of an acceleration component over the first interval.
-    structure : Lagrangian structure function at the times `lags`.
+    structure : Lagrangian structure function at the time lags `lags`.
     """
 
     times: np.ndarray
@@ -65,7 +65,7 @@ class TracerStatistics:
 
     @property
     def ballistic_exponent(self) -> float:
-        """Exponent of the pair dispersion at the first two times after the start, mean over distances; ballistic: 2."""
+        """Exponent of pair dispersion at the first two times after the start, mean over distances; 2 if ballistic."""
         exponents = [first_exponent(self.times[1:], pairs.spread[1:]) for pairs in self.dispersion]
         return float(np.mean(exponents)) if exponents else np.nan
 
@@ -108,7 +108,10 @@ def _energy_ratio(tracers: Frames, spectra: Mapping[str, np.ndarray]) -> tuple[n
 
 
 def _accelerations(velocity: np.ndarray) -> tuple[np.ndarray, float]:
-    """PDF and kurtosis, averaged over the intervals, so that the decay of the flow does not widen the tails."""
+    """PDF and kurtosis of accelerations, both averaged over the intervals between frames.
+
+    The average keeps the decay of the flow from widening the tails.
+    """
     probability, kurtosis = [], []
     for earlier, later in zip(velocity, velocity[1:]):
         rms = np.sqrt(np.mean((later - earlier) ** 2))

@@ -1,11 +1,11 @@
 """Velocities and accelerations along measured tracks, by smoothing splines.
 
-A track is a cubic spline with a knot at each of its times that minimises
+Each track is approximated by a cubic spline s(t) with a knot at each time t_i of the track. The spline minimises
 
-    sum_i |x_i - s(t_i)|^2 + mu h^5 int |s'''|^2 dt,    h the median interval of all tracks,
+    sum_i |x_i - s(t_i)|^2 + mu h^5 int |s'''|^2 dt,    h the median interval of all tracks.
 
-the estimate for noise of equal variance and a jerk that is white noise (TrackFit; Gesemann, Huhn, Schanz and Schröder
-2016). It damps frequencies above mu^(-1/6) / h. The ends need no condition.
+This is the estimate for noise of equal variance and a jerk that is white noise (TrackFit; Gesemann, Huhn, Schanz and
+Schröder 2016). It damps frequencies above mu^(-1/6) / h. The ends need no condition.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
     ----------
     time, track : (rows,), in any order. position : (rows, 3), wrapped or not.
     edge : edge of a periodic cube, or None. Particles must move by less than half an edge between rows of a track.
-    noise : standard deviation of the error of a coordinate. It determines mu: the squared residuals sum up to noise^2
-        times their degrees of freedom.
+    noise : standard deviation of the error of a coordinate. It determines mu: the sum of the squared residuals is
+        noise^2 times its degrees of freedom.
     """
     order = np.lexsort((time, track))
     ends = np.flatnonzero(np.diff(track[order], append=track[order][-1] - 1)) + 1
@@ -87,7 +87,7 @@ class Fit:
         self._penalty = interval**5 * jerk.T @ dia_array((np.diff(times)[None], [0]), shape=[len(times) - 1] * 2) @ jerk
 
     def spline(self, smoothing: float, values: np.ndarray | None = None) -> BSpline:
-        """The splines for mu = `smoothing`, of the positions or of other values (n, columns)."""
+        """The splines for mu = `smoothing` of `values` (n, columns), by default the positions."""
         matrix = self._basis.T @ self._basis + smoothing * self._penalty
         bands = np.zeros((DEGREE + 1, matrix.shape[0]))
         for offset in range(DEGREE + 1):
@@ -96,13 +96,13 @@ class Fit:
         return BSpline(self._knots, solveh_banded(bands, right, lower=True), DEGREE)
 
     def residual(self, smoothing: float) -> tuple[float, float]:
-        """Sum of squared residuals, and its degrees of freedom: number of values minus those of the splines."""
+        """Sum of squared residuals, and its degrees of freedom: values minus the trace of the smoother matrix."""
         squares = float(np.sum((self.spline(smoothing)(self.times) - self._values) ** 2))
         influence = self.spline(smoothing, np.eye(len(self.times)))(self.times)
         return squares, 3 * self.tracks * (len(self.times) - float(np.trace(influence)))
 
     def derivatives(self, smoothing: float) -> Iterator[np.ndarray]:
-        """Position, velocity and acceleration (tracks * n, 3), by track."""
+        """Yield position, velocity and acceleration, each (tracks * n, 3), track after track."""
         spline = self.spline(smoothing)
         for order in range(DEGREE):
             values = spline.derivative(order)(self.times) if order else spline(self.times)
@@ -110,7 +110,7 @@ class Fit:
 
 
 def _smoothing_of(fits: list[Fit], noise: float) -> float:
-    """The mu with which residuals have the variance of the noise, from the longest tracks."""
+    """The mu for which the residuals of the longest tracks have the variance of the noise."""
     chosen, tracks = [], 0
     for fit in sorted(fits, key=lambda fit: -len(fit.times)):
         chosen.append(fit)

@@ -16,7 +16,7 @@ def invariants(gradient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def enstrophy_scale(gradient: np.ndarray) -> float:
-    """<Q_w> = <W_ij W_ij> / 2, W the antisymmetric part: the unit of Q; the unit of R is its power 3/2."""
+    """<Q_w> = <W_ij W_ij> / 2 with the antisymmetric part W. It is the unit of Q, and <Q_w>^(3/2) that of R."""
     rotation = (gradient - np.swapaxes(gradient, -1, -2)) / 2
     return float(np.mean(np.sum(rotation**2, axis=(-2, -1))) / 2)
 
@@ -54,7 +54,10 @@ class InvariantBins:
 
     @classmethod
     def covering(cls, second: np.ndarray, third: np.ndarray, quantile: float = 0.999) -> "InvariantBins":
-        """Symmetric ranges that each hold this fraction of the sample, in 12 to 64 bins; larger samples get more."""
+        """Bins of symmetric ranges of Q and of R that each hold the fraction `quantile` of the sample.
+
+        The number of bins per axis is the cube root of the sample size, but between 12 and 64.
+        """
         bins = int(np.clip(round(second.size ** (1 / 3)), 12, 64))
         limits = [np.quantile(np.abs(values), quantile) for values in (second, third)]
         return cls(*(np.linspace(-limit, limit, bins + 1) for limit in limits))
@@ -78,7 +81,7 @@ class InvariantBins:
 class ConditionalVelocity:
     """Conditional mean of (dQ/dt, dR/dt) of Lagrangian particles given (Q, R), from sums in bins.
 
-    Rates are in units of <Q_w>^(3/2) and <Q_w>^2. Particles outside the bins are left out.
+    The units of the two rates are <Q_w>^(3/2) and <Q_w>^2. Particles outside the bins are left out.
     """
 
     def __init__(self, bins: InvariantBins) -> None:
@@ -88,7 +91,8 @@ class ConditionalVelocity:
     def add(self, before: Invariants, after: Invariants, interval: float, scale: float) -> None:
         """Add the same particles at two times, `interval` apart; `scale` is <Q_w>.
 
-        The rate is the difference over the interval. It belongs to the mean of both times (second order).
+        The rate is the difference divided by the interval. It is assigned to the mean (Q, R) of both times, which is
+        accurate to second order.
         """
         q0, r0, q1, r1 = (values.astype(float) for values in (before.second, before.third, after.second, after.third))
         middle = (q0 + q1) / 2 / scale, (r0 + r1) / 2 / scale**1.5

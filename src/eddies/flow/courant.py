@@ -15,9 +15,9 @@ EVERY = 8  # steps between two measurements of the speed
 class CourantLimit:
     """Time step with  step * (max(|u| + |v| + |w|) + sqrt(3) c) <= courant * dx.
 
-    Steps are taken from the ladder largest * 2^-m. The sound speed c counts only for a stepper that treats sound
-    explicitly; otherwise pass 0. The factor sqrt(3) belongs to sound that travels along the diagonal. The speed is
-    measured every EVERY steps.
+    Steps are taken from the ladder largest * 2^-m. `sound_speed` is c for a stepper that treats sound explicitly, and 0
+    for others. The factor sqrt(3) belongs to sound that travels along the diagonal. The flow speed is measured every
+    EVERY steps.
     """
 
     def __init__(self, grid: SpectralGrid, courant: float, largest: float, sound_speed: float = 0.0) -> None:

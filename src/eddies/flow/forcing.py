@@ -19,8 +19,8 @@ class LinearForcing:
     unfiltered modes, and f is the filtered force of the unfiltered flow.
 
     All ranks hold the few forced modes; one reduction collects them. In the plane kx = 0 mirror modes are made
-    conjugate, because the forcing would amplify a part that no real field has. The first evaluation raises UserError
-    if the velocity has no energy at the forced modes.
+    conjugate. Otherwise the forcing would amplify a part that no real field has. The first evaluation raises
+    UserError if the velocity has no energy at the forced modes.
     """
 
     def __init__(self, grid: SpectralGrid, injection_rate: float, wavenumber: float,
@@ -35,7 +35,7 @@ class LinearForcing:
         self._forced = (squared > 0) & (squared < wavenumber**2)
         unit = 2 * np.pi / grid.decomposition.length
         self._weights = np.where(kx == 0, 1, 2) / gaussian_transfer(unit**2 * squared, filter_width) ** 2
-        # Rows of ky of the forced modes, in this rank's array and in the block of all of them.
+        # Rows of ky of the forced modes, in this rank's array and in the block of all forced modes.
         own_ky = grid.index[1].ravel()
         self._own_rows = np.flatnonzero(np.abs(own_ky) <= reach)
         self._block_rows = own_ky[self._own_rows] + reach

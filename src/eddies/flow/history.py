@@ -38,7 +38,7 @@ class FlowHistory:
             self.sample(state, clock)
 
     def sample(self, state: np.ndarray, clock: Clock) -> dict[str, float]:
-        """Return the row of this step. It is measured and stored unless the last row already is the one of this step.
+        """Return the row of this step. It is measured and stored unless the last row already belongs to this step.
 
         Raises FlowDiverged if the flow is not finite.
         """
@@ -60,7 +60,7 @@ class FlowHistory:
         return row
 
     def leave_out(self, seconds: float) -> None:
-        """Exclude wall time since the last sample from the seconds per step."""
+        """Exclude these seconds of wall time since the last sample from the seconds per step."""
         self._wall += seconds
 
     @property

@@ -10,8 +10,7 @@ def random_velocity(grid: SpectralGrid, seed: int, amplitude: float, peak_wavenu
     """Return a Gaussian solenoidal velocity (3, kz, ky, kx) with the spectrum E(k) ~ k^4 exp(-2 (k / k_p)^2).
 
     `amplitude` is the rms of one component. Random numbers are keyed by (seed, ky, kz) and drawn along kx, so the field
-    depends neither on the number of ranks nor on the resolution. Every shell has
-    exactly the energy of this spectrum.
+    depends neither on the number of ranks nor on the resolution. Every shell has exactly the energy of this spectrum.
     """
     velocity, energy = _gaussian_solenoidal(grid, seed)
     k = np.arange(len(energy))
@@ -22,7 +21,8 @@ def random_velocity(grid: SpectralGrid, seed: int, amplitude: float, peak_wavenu
 def velocity_of_spectrum(grid: SpectralGrid, seed: int, wavenumber: np.ndarray, energy: np.ndarray) -> np.ndarray:
     """Return a Gaussian solenoidal velocity (3, kz, ky, kx) with the spectrum `energy` at ascending wavenumbers.
 
-    ln E is linear in ln k between them, and E is zero beyond them. Random numbers are those of `random_velocity`.
+    ln E is linear in ln k between the given wavenumbers, and E is zero outside their range. Random numbers are those of
+    `random_velocity`.
     """
     velocity, present = _gaussian_solenoidal(grid, seed)
     given = energy > 0
@@ -32,7 +32,7 @@ def velocity_of_spectrum(grid: SpectralGrid, seed: int, wavenumber: np.ndarray, 
 
 
 def _gaussian_solenoidal(grid: SpectralGrid, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a solenoidal velocity of normally distributed modes without a mean, and its spectrum."""
+    """Return a solenoidal velocity with normally distributed modes and zero mean, and its spectrum."""
     velocity = grid.solenoidal(_gaussian_modes(grid, seed))
     velocity[:, grid.index_squared == 0] = 0
     return velocity, energy_spectrum(grid, velocity)[1]
@@ -62,7 +62,10 @@ def _gaussian_modes(grid: SpectralGrid, seed: int) -> np.ndarray:
 
 
 def taylor_green(grid: SpectralGrid, amplitude: float) -> np.ndarray:
-    """Return the Taylor-Green vortex (sin x cos y cos z, -cos x sin y cos z, 0), energy amplitude^2 / 8."""
+    """Return the Taylor-Green vortex, amplitude (sin x cos y cos z, -cos x sin y cos z, 0).
+
+    Its energy is amplitude^2 / 8.
+    """
     x, y, z = grid.coordinates()
     u = np.sin(x) * np.cos(y) * np.cos(z)
     v = -np.cos(x) * np.sin(y) * np.cos(z)
@@ -70,7 +73,10 @@ def taylor_green(grid: SpectralGrid, amplitude: float) -> np.ndarray:
 
 
 def abc(grid: SpectralGrid, amplitude: float, wavenumber: int) -> np.ndarray:
-    """Return the Arnold-Beltrami-Childress flow with A = B = C. Vorticity = k velocity: it decays as exp(-nu k^2 t)."""
+    """Return the Arnold-Beltrami-Childress flow with A = B = C = amplitude.
+
+    Its vorticity is k times its velocity, so that the flow decays as exp(-nu k^2 t).
+    """
     x, y, z = (wavenumber * axis for axis in grid.coordinates())
     return _modes(grid, amplitude, [np.sin(z) + np.cos(y), np.sin(x) + np.cos(z), np.sin(y) + np.cos(x)])
 
@@ -88,11 +94,14 @@ def sound_wave_density(grid: SpectralGrid, amplitude: float, wavenumber: int) ->
 
 
 def balanced_density(grid: SpectralGrid, velocity: np.ndarray, sound_speed: float) -> np.ndarray:
-    """Return s = p / c^2 (kz, ky, kx), p the incompressible pressure. A flow that starts so emits almost no sound."""
+    """Return s = p / c^2 (kz, ky, kx) with the incompressible pressure p.
+
+    A flow with this initial s emits almost no sound.
+    """
     return grid.pressure_of(grid.squares(velocity)) / sound_speed**2
 
 
-#: Initial velocity by [initial] kind: functions of the grid, the section [initial] and the seed.
+#: Functions that return the initial velocity, by [initial] kind. Arguments: grid, section [initial], seed.
 INITIAL_FLOWS = {
     "random": lambda grid, initial, seed: random_velocity(grid, seed, initial.amplitude, initial.peak_wavenumber),
     "taylor-green": lambda grid, initial, seed: taylor_green(grid, initial.amplitude),

@@ -21,11 +21,11 @@ class Fluid:
     grid : grid of the flow.
     viscosity : kinematic viscosity nu.
     sound_speed : c; infinite for an incompressible fluid.
-    forcing : adds a force to the velocity's tendency. It is removed when tracers are released.
+    forcing : adds a force to the velocity's tendency. The release of tracers ends it unless [tracers] forced is true.
     closure : force of the scales that a coarse grid or a filter leaves out.
 
-    `compressible` fluids have the state (u, v, w, s) with s = ln(rho / rho_0), modes (4, kz, ky, kx); others have the
-    velocity (3, kz, ky, kx). `transforms` counts the Fourier transforms of one evaluation of N.
+    The state is held as modes. If `compressible`, it is (u, v, w, s) with s = ln(rho / rho_0), (4, kz, ky, kx);
+    otherwise it is the velocity, (3, kz, ky, kx). `transforms` counts the Fourier transforms of one evaluation of N.
     """
 
     compressible: bool
@@ -120,7 +120,8 @@ class CompressibleFluid(Fluid):
 
         L acts on the transverse velocity as -nu k^2, and on (s, longitudinal u) as the block
         [[0, -ik], [-i c^2 k, -2 gamma]], gamma = 2/3 nu k^2, with the eigenvalues -gamma +- sqrt(gamma^2 - c^2 k^2).
-        With M = step * block, f(M) = f[z1, z2] M + (f(z1) - z1 f[z1, z2]) I.
+        With M = step * block, its eigenvalues z1 and z2, and the divided difference f[z1, z2], the function is
+        f(M) = f[z1, z2] M + (f(z1) - z1 f[z1, z2]) I.
         """
         nu, c = self.viscosity, self.sound_speed
 

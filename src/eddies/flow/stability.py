@@ -13,7 +13,8 @@ from eddies.flow.navier_stokes import Fluid, advective_speed
 from eddies.parallel.reduction import global_max, global_sum
 from eddies.time_stepping import RungeKutta4
 
-# Reach of a four-stage fourth-order Runge-Kutta method: |1 + z + z^2/2 + z^3/6 + z^4/24| = 1 on the axes.
+# Where the axes leave the stability region |1 + z + z^2/2 + z^3/6 + z^4/24| <= 1 of the four-stage fourth-order
+# Runge-Kutta method.
 IMAGINARY_REACH, REAL_REACH = math.sqrt(8), 2.785293563405282
 
 # Above this advective number undamped sound grows by more than 0.1 % a step with ETDRK4: see `limits_of_step`.
@@ -72,14 +73,15 @@ def limits_of_step(k_max: float, step: float, speed: float, viscosity: float, ex
 
     k_max is the cutoff of each axis. The eigenvalues of the largest modulus belong to |k| = sqrt(3) k_max. They are
     i k_max (|u| + |v| + |w|) for advection, with i sqrt(3) k_max c added for sound. For viscosity they are
-    -3 nu k_max^2, or -4 nu k_max^2 in a compressible fluid. RK4 is stable up to where its region meets the axes.
+    -3 nu k_max^2, or -4 nu k_max^2 in a compressible fluid. The limits of RK4 are where its stability region ends on
+    the axes.
 
-    ETDRK4 treats viscosity and sound exactly. Without them its region is as for RK4. Viscosity widens it: it reaches
-    3.2, 3.9 and 4.9 at nu k^2 step = 1, 3 and 5, and about 0.7 nu k^2 step beyond. With undamped sound, waves with
-    c k step between 1 and 7 grow also inside it. In a uniform flow they grow by up to 0.1, 2, 7 and 15 % per step at an
-    advective number of 0.5, 1, 1.5 and 2. A damping 2/3 nu k^2 step of 0.0013, 0.024, 0.1 and 0.22 stops them. In
-    turbulence few points move at the largest speed: 60 steps at three times the boundary did not raise its energy
-    tenfold (12^3 cells, M_t from 0.01 to 0.5).
+    ETDRK4 treats viscosity and sound exactly. Without them its stability region is that of RK4. Viscosity raises the
+    largest stable advective number to 3.2, 3.9 and 4.9 at nu k^2 step = 1, 3 and 5, and to about 0.7 nu k^2 step at
+    larger values. Undamped sound waves with c k step between 1 and 7 grow even inside the stability region. In a
+    uniform flow they grow by up to 0.1, 2, 7 and 15 % per step at an advective number of 0.5, 1, 1.5 and 2. A damping
+    2/3 nu k^2 step of 0.0013, 0.024, 0.1 and 0.22 stops this growth. In turbulence few points move at the largest
+    speed: 60 steps at three times the limit did not raise the energy tenfold (12^3 cells, M_t from 0.01 to 0.5).
     """
     limits = [StepLimit("advection", "step x k_max x max(|u| + |v| + |w|)", step * k_max * speed, IMAGINARY_REACH)]
     if explicit:
@@ -95,7 +97,7 @@ def limits_of_step(k_max: float, step: float, speed: float, viscosity: float, ex
 
 
 def advice(fluid: Fluid, limits: Sequence[StepLimit], kmax_eta: float, mach: float = 0.0) -> str:
-    """Return the remedy for an unstable run: for the broken limits, a supersonic flow (M_t > 1) or the resolution."""
+    """Return the remedy for an unstable run: for exceeded limits, else for M_t > 1 (supersonic), else resolution."""
     broken = [limit for limit in limits if limit.exceeded]
     if broken:
         return "Exceeded limits: " + "; ".join(f"{limit}: {REMEDIES[limit.name]}" for limit in broken)
@@ -135,10 +137,10 @@ class StabilityWatch:
         self._ceiling = math.inf
 
     def __call__(self, before: np.ndarray, after: np.ndarray, step: float, clock: Clock) -> None:
-        """Raise FlowDiverged if the step from `before` to `after`, which ends now, was unstable.
+        """Raise FlowDiverged if the step from the state `before` to the state `after` was unstable.
 
-        It was unstable if the energy exceeds GROWTH times the available energy, which is the smallest energy so far
-        plus the energy injected since then.
+        A step is unstable if the energy then exceeds GROWTH times the available energy. The available energy is the
+        smallest energy so far plus the energy injected since then.
         """
         if self._ceiling == math.inf:
             self._ceiling = quadratic_energy(self.fluid, before)

@@ -74,7 +74,7 @@ def _skewness_and_flatness(moments: np.ndarray) -> tuple[float, float]:
 
 
 def incompressible_budget(grid: SpectralGrid, velocity: np.ndarray, viscosity: float) -> dict[str, float]:
-    """Return the total energy <u.u>/2 and the dissipation rate nu <|grad u|^2>."""
+    """Return `total_energy`, <u.u>/2, and `dissipation_rate`, nu <|grad u|^2>."""
     squared = (np.abs(velocity) ** 2).sum(axis=0)
     return {"total_energy": 0.5 * grid.sum_modes(squared),
             "dissipation_rate": viscosity * grid.sum_modes(grid.wavenumber_squared * squared)}
@@ -82,10 +82,12 @@ def incompressible_budget(grid: SpectralGrid, velocity: np.ndarray, viscosity: f
 
 def compressible_budget(grid: SpectralGrid, state: np.ndarray, viscosity: float,
                         sound_speed: float) -> dict[str, float]:
-    """Return the total energy <rho |u|^2/2 + c^2 (rho ln rho - rho + 1)> and the rate nu <rho (2 S:S - 2/3 (div u)^2)>.
+    """Return the energy budget of a compressible flow, and more statistics.
 
-    Without forcing the energy decays at exactly this rate. The result also has the rms of the density, the share of
-    the kinetic energy in the longitudinal velocity, and the moments of `gradient_moments`.
+    `total_energy` is <rho |u|^2/2 + c^2 (rho ln rho - rho + 1)>. Without forcing it decays exactly at
+    `dissipation_rate`, nu <rho (2 S:S - 2/3 (div u)^2)>. `compressible_fraction` is the share of <u.u> in the
+    longitudinal velocity. `density_rms` is the rms fluctuation of rho, with rho_0 = 1. `skewness` and `flatness` are as
+    in `gradient_moments`.
     """
     def with_gradients(modes: np.ndarray) -> list[np.ndarray]:
         return [modes[:4], (grid.d_dx, modes[:3]), (grid.d_dy, modes[:3]), modes[4:]]

@@ -10,8 +10,8 @@ from eddies.spectral.spectral_grid import SpectralGrid
 
 # Number of times that each entry xx, yy, zz, xy, xz, yz occurs in a symmetric matrix.
 TIMES = np.array([1, 1, 1, 2, 2, 2])
-# nu_t (k_c / E(k_c))^(1/2) far below k_c, its growth towards k_c, and the rate of that growth (Chollet and Lesieur
-# 1981, in the form of Lesieur and Metais 1996, Kolmogorov constant 1.4).
+# Constants of nu_t (k_c / E(k_c))^(1/2): its value far below k_c, its growth towards k_c, and the rate of the growth
+# (Chollet and Lesieur 1981, in the form of Lesieur and Metais 1996, Kolmogorov constant 1.4).
 PLATEAU, CUSP, STEEPNESS = 0.267, 34.5, 3.03
 
 
@@ -19,10 +19,10 @@ class Closure:
     """Base of all closures. Velocities and forces are modes (3, kz, ky, kx)."""
 
     def begin_step(self, velocity: np.ndarray) -> None:
-        """Measure quantities that stay constant during a step, in the velocity at its start; collective."""
+        """From the velocity at the start of a step, compute what stays constant during the step; collective."""
 
     def add(self, velocity: np.ndarray, tendency: np.ndarray) -> None:
-        """Add the force to the velocity's tendency in place."""
+        """Add the force to `tendency`, the rate of change of the velocity, in place."""
         raise NotImplementedError
 
 
@@ -32,8 +32,9 @@ class StressModel(Closure):
         tau = (d^2/12) grad u grad u^T - 2 l^2 |S| S,    S = (grad u + grad u^T) / 2,   |S| = (2 S:S)^(1/2).
 
     The first part is the leading term of the stress that a filter of width d hides (Leonard 1975; Clark et al. 1979).
-    The second is an eddy viscosity l^2 |S| with the mixing length l (Smagorinsky 1963), which dissipates
-    <2 l^2 |S| S:S>. Either width may be 0. The stress is formed at the grid points; the 2/3 rule does not dealias |S|.
+    The second is an eddy viscosity l^2 |S| with the mixing length l (Smagorinsky 1963), which dissipates energy at
+    the rate <2 l^2 |S| S:S>. Either l or d may be 0. The stress is computed at the grid points. The 2/3 rule does not
+    remove the aliasing errors of |S|.
 
     Parameters
     ----------
@@ -61,7 +62,7 @@ class StressModel(Closure):
         return self.modes_of(tau, velocity)
 
     def modes_of(self, formula: Callable[[np.ndarray], np.ndarray], velocity: np.ndarray) -> np.ndarray:
-        """Return the modes of a formula (6, ...) of the velocity gradients (9, ...) at the grid points."""
+        """Return the modes of `formula`, which maps velocity gradients (9, ...) at grid points to values (6, ...)."""
         grid = self.grid
 
         def gradients(modes: np.ndarray) -> list[np.ndarray]:
@@ -79,11 +80,13 @@ class DynamicStress(StressModel):
 
         l^2 = max(<(L - H):M> / <M:M>, 0),   L = (uu)^ - u^ u^,   M = 2 ((|S|S)^ - r |S^|S^).
 
-    ^ is a test filter. It and the first filter form the combined filter. r is the squared width of the combined filter
-    divided by that of the first filter. H is the gradient part of the combined filter minus the test-filtered
-    gradient part of the first filter. Without a filter width the first filter is the grid, and ^ cuts off above half
-    the highest wavenumber of the grid. All tensors then have only the modes below this cutoff. With a width d the first
-    filter is Gaussian of width d, ^ is Gaussian of width 2 d, and r = 5.
+    ^ is a test filter, applied after the first filter, that of the simulation. Both together form the combined filter.
+    r is the ratio of the squared widths of the combined and the first filter. H is the gradient part of the stress of
+    the combined filter minus the test-filtered gradient part of the first filter.
+
+    With a filter width d, the first filter is Gaussian of width d, ^ is Gaussian of width 2 d, and r = 5. If the filter
+    width is 0, the first filter is the grid, and ^ cuts off above half the highest wavenumber of the grid. All tensors
+    then have only the modes up to this cutoff.
     """
 
     def __init__(self, grid: SpectralGrid, filter_width: float, with_gradient: bool = False) -> None:
@@ -108,7 +111,7 @@ class DynamicStress(StressModel):
         self.squared_length = max(numerator / norm, 0.0) if norm > 0 else 0.0
 
     def _contraction(self, one: np.ndarray, other: np.ndarray) -> float:
-        """Return <A:B> of symmetric tensors, over the modes that pass the test filter."""
+        """Return <A:B> of two symmetric tensors. Only the modes that pass the test filter count."""
         products = np.tensordot(TIMES, (one.conj() * other).real, axes=1)
         return self.grid.sum_modes(np.where(self.test > 0, products, 0))
 
@@ -143,9 +146,9 @@ class SpectralViscosity(ModeDamping):
 class EddyDamping(ModeDamping):
     """Force -D(k) u with the learned damping D of the particle model.
 
-    D is k_c u_c times a function of k with the values `rates` at wavenumbers equally spaced up to k_c. The function is
-    linear between these wavenumbers, and D(0) = 0.
-    k_c is the highest wavenumber of the grid, u_c the rms of a component of the modes above k_c/2.
+    D = k_c u_c f(k). The function f has the values `rates` at wavenumbers that are equally spaced up to k_c. It is
+    linear between these wavenumbers, and f(0) = 0. k_c is the highest wavenumber of the grid. u_c is the rms of one
+    velocity component, from the modes above k_c/2.
     """
 
     def __init__(self, grid: SpectralGrid, rates: np.ndarray) -> None:
@@ -157,7 +160,7 @@ class EddyDamping(ModeDamping):
 
 
 def strain_product(gradients: np.ndarray) -> np.ndarray:
-    """Return |S| S (6, ...) of velocity gradients (9, ...), in which the component index runs fastest."""
+    """Return |S| S (6, ...) of velocity gradients (9, ...) in the order du/dx, dv/dx, dw/dx, du/dy, ..."""
     d_dx, d_dy, d_dz = gradients.reshape(3, 3, *gradients.shape[1:])
     strain = np.stack([d_dx[0], d_dy[1], d_dz[2],
                        (d_dx[1] + d_dy[0]) / 2, (d_dx[2] + d_dz[0]) / 2, (d_dy[2] + d_dz[1]) / 2])
@@ -166,6 +169,6 @@ def strain_product(gradients: np.ndarray) -> np.ndarray:
 
 
 def gradient_product(gradients: np.ndarray) -> np.ndarray:
-    """Return d_k u_i d_k u_j (6, ...) of velocity gradients (9, ...), in which the component index runs fastest."""
+    """Return d_k u_i d_k u_j (6, ...) of velocity gradients (9, ...) in the order du/dx, dv/dx, dw/dx, du/dy, ..."""
     u, v, w = np.moveaxis(gradients.reshape(3, 3, *gradients.shape[1:]), 1, 0)
     return np.stack([(a * b).sum(axis=0) for a, b in ((u, u), (v, v), (w, w), (u, v), (u, w), (v, w))])

@@ -14,7 +14,7 @@ from eddies.spectral.spectral_grid import SpectralGrid
 def random_positions(seed: int, total: int, start: int, stop: int, length: float) -> np.ndarray:
     """Return uniformly random positions (stop - start, 3) of the particles with ids start ... stop - 1.
 
-    The numbers are keyed by id, so they do not depend on the number of ranks.
+    A position depends only on `seed`, `total` and the id, not on the number of ranks.
     """
     # Philox yields four 64-bit numbers per counter value; each particle takes one counter value.
     generator = np.random.Generator(np.random.Philox(key=[seed, total]).advance(start))
@@ -22,7 +22,7 @@ def random_positions(seed: int, total: int, start: int, stop: int, length: float
 
 
 def lattice_positions(seed: int, per_side: int, start: int, stop: int, length: float) -> np.ndarray:
-    """Return positions of ids start ... stop - 1 on a cubic lattice, displaced at random by up to a quarter cell."""
+    """Return lattice positions of ids start ... stop - 1; each coordinate is displaced at random by up to 1/4 cell."""
     ids = np.arange(start, stop)
     cell = length / per_side
     corner = np.stack([ids % per_side, ids // per_side % per_side, ids // per_side**2], axis=1)
@@ -31,9 +31,9 @@ def lattice_positions(seed: int, per_side: int, start: int, stop: int, length: f
 
 
 def release(decomposition: SlabDecomposition, seed: int, total: int, placement: str) -> dict[str, np.ndarray]:
-    """Return ids and positions of new particles, each on the rank whose slab holds it.
+    """Return `id` and `position` of new particles; each particle is on the rank whose slab holds it.
 
-    `placement` is "random" or "lattice"; on a lattice `total` is a cubic number.
+    `placement` is "random" or "lattice"; for a lattice, `total` is the cube of an integer.
     """
     start, stop = id_block(decomposition.comm, total)
     if placement == "random":
@@ -44,10 +44,10 @@ def release(decomposition: SlabDecomposition, seed: int, total: int, placement: 
 
 
 class FilteredField:
-    """Gaussian-filtered velocity of a state, and filtered density of a compressible one, at arbitrary points.
+    """Gaussian-filtered velocity at arbitrary points, and in a compressible flow also the filtered density.
 
-    Points may lie in this rank's slab or in the `margin` planes beside it. A particle crosses at most `margin` planes
-    in a step.
+    Points may lie in this rank's slab or in the `margin` planes on each side of it. So a particle may cross at most
+    `margin` planes in a step.
     """
 
     def __init__(self, grid: SpectralGrid, filter_width: float, interpolation: str, margin: int = 1) -> None:
@@ -67,8 +67,8 @@ class FilteredField:
 class TracerParticles:
     """Advection dx/dt = v(x, t) by the filtered velocity with Heun's method, second order in time.
 
-    `columns` holds this rank's `id`, `position` and `velocity`, the filtered velocity at the particle. If the velocity
-    is not given, it is taken from `state`.
+    `columns` holds `id`, `position` and `velocity` of this rank's particles. `velocity` is the filtered velocity at the
+    particle; if it is absent, it is computed from `state`.
     """
 
     def __init__(self, field: FilteredField, columns: dict[str, np.ndarray], state: np.ndarray) -> None:
@@ -80,7 +80,7 @@ class TracerParticles:
             self.columns = {**columns, "velocity": velocity}
 
     def advance(self, state: np.ndarray, step: float) -> None:
-        """Advance the particles by one step; `state` is the flow at its end."""
+        """Advance the particles by one step; `state` is the flow at the end of the step."""
         coefficients = self.field.velocity_coefficients(state)
         position, velocity = self.columns["position"], self.columns["velocity"]
         predicted = position + step * velocity

@@ -1,8 +1,8 @@
 """Checkpoints: files step-NNNNNNNN.h5 with global arrays, which do not depend on the number of ranks.
 
-io/new_files.py describes how they are written. Settings and values that are not arrays are stored together, as one
-dataset of JSON. Checksums (io/checksums.py) cover every byte, and a damaged checkpoint is not used. Other files of the
-directory may belong to a checkpoint, which then stores their checksums.
+io/new_files.py describes how they are written. Everything that is not an array is stored together, as one dataset of
+JSON. Checksums (io/checksums.py) cover every byte, and a damaged checkpoint is not used. Other files of the directory
+may belong to a checkpoint, which then stores their checksums.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ KEPT = 3
 NAME = re.compile(r"step-(\d{8,})(\.h5)?")
 PLAIN = "plain"  # the dataset of everything that is not an array, as JSON
 # Checkpoints of another format are not used. Raise this number also when FORMAT of io/provenance.py is raised, because
-# frames are products.
+# the files with the frames of a checkpoint are products.
 FORMAT = 11
 
 
 @dataclass(frozen=True)
 class Block:
-    """This rank's part of a global array: rows start, start + 1, ... of `total` along an axis, or no row."""
+    """This rank's part of a global array: rows start, start + 1, ... of `total` along `axis`, or no row."""
 
     values: np.ndarray
     start: int
@@ -62,12 +62,12 @@ class Checkpoint(Mapping):
 
     @cached_property
     def content(self) -> dict[str, Any]:
-        """`step`, `format`, `fingerprint`, `computed_by`, plain `values`, and checksums of `files` by name."""
+        """A dict of `step`, `format`, `fingerprint`, `computed_by`, `values` (no arrays) and `files` (checksums)."""
         return json.loads(self.read(PLAIN).tobytes())
 
     @property
     def files(self) -> list[str]:
-        """The files beside the checkpoint that belong to it."""
+        """Names of the files in the same directory that belong to the checkpoint."""
         return list(self.content["files"])
 
     def __getitem__(self, name: str) -> Any:
@@ -96,9 +96,9 @@ class CheckpointDirectory:
     def write(self, step: int, state: Mapping[str, Any], files: Sequence[str] = ()) -> None:
         """Add a checkpoint, and remove all but the newest KEPT. If it cannot be written, earlier ones stay intact.
 
-        `state` holds `Block`s of arrays, other arrays, and values for JSON. Other arrays and values are taken from
-        rank 0, because the ranks may have measured different times. `files` are names of closed files of the directory
-        that belong to the checkpoint.
+        `state` holds, by name, `Block`s of arrays, whole arrays, and values for JSON. Whole arrays and values are taken
+        from rank 0; on other ranks, measured times may differ. `files` are names of closed files of the directory that
+        belong to the checkpoint.
         """
         path = self.path / f"step-{step:08d}.h5"
         arrays = {name: part for name, part in state.items() if isinstance(part, np.ndarray | Block)}
@@ -124,10 +124,10 @@ class CheckpointDirectory:
         in_files(self.comm, self.path, lambda: [old.unlink() for old in _newest_first(self.path)[KEPT:]])
 
     def newest(self) -> Checkpoint | None:
-        """The newest undamaged checkpoint with these settings, or None. It, its files and older checkpoints are kept;
-        everything else in the directory is removed. A warning says why a newer checkpoint is not used.
+        """The newest undamaged checkpoint with this fingerprint, or None. This checkpoint, its files and older
+        checkpoints are kept; everything else in the directory is removed. A warning says why a newer one is not used.
 
-        Raises ProductError, and removes nothing, if the system refuses to read a file, which may be undamaged.
+        Raises ProductError, and removes nothing, if the system refuses to read a file: the file may be undamaged.
         """
         paths = in_files(self.comm, self.path, lambda: _newest_first(self.path))
         while paths and (complaint := self._complaint(paths[0])):
@@ -178,9 +178,10 @@ class Guard:
         self.stop, self.of = stop or StopRequest(comm), of
 
     def __call__(self, run: Any, segments: FrameSegments | None = None) -> None:
-        """Call it before each step. `run` has `steps` and `state_dict()`; its frames go to `segments`.
+        """Write a checkpoint if one is due; to be called before each step.
 
-        If the run has to stop, the call raises Stopped after the checkpoint is complete.
+        `run` has the step number `steps` and `state_dict()`; `segments` holds its frames. If the run has to stop, the
+        call raises Stopped after the checkpoint is complete.
         """
         stopping = self.stop()
         if self.stop.checkpoint_due:
@@ -201,7 +202,7 @@ class Guard:
 def checkpoints_in(path: Path) -> list[tuple[int, str]]:
     """Step and fingerprint of each readable checkpoint in a directory, the newest first; on one rank.
 
-    The fingerprint is "" for a checkpoint of another format. Raises ProductError if the system refuses to read one.
+    The fingerprint is "" for a checkpoint of another format. ProductError if the system refuses to read a checkpoint.
     """
     contents = [content for each in _newest_first(path) if (content := _content(each)) is not None]
     return [(content["step"], content["fingerprint"] if content["format"] == FORMAT else "") for content in contents]
@@ -238,8 +239,8 @@ def _computed_by() -> str:
 def _write_array(file: h5py.File, name: str, block: Block) -> None:
     """Write a global array from the blocks of all ranks.
 
-    Blocks that are distributed along another axis than the first are written one component at a time: MPI counts bytes
-    in 32 bits, and a single writer holds each written part in memory.
+    If the blocks are distributed along a later axis than the first, one index of the first axis is written at a time:
+    MPI counts bytes in 32 bits, and a single writer holds each written part in memory.
     """
     values, axis = block.values, block.axis
     shape = (*values.shape[:axis], block.total, *values.shape[axis + 1:])

@@ -1,8 +1,9 @@
 """Checksums of HDF5 files: the CRC-32 of every 4096 bytes, in a table after the end of the HDF5 data.
 
-They cover all bytes, also those of HDF5's own structure. `open_to_read` opens a file so that each block is compared
-with its checksum before HDF5 sees it: a reader of a few frames checks only their blocks, on any number of ranks.
-`add_checksums` and `find_damage` process a whole file; the ranks share the blocks. Only these two import MPI.
+The checksums cover all bytes, also those of HDF5's own structure. `open_to_read` opens a file so that each block of
+4096 bytes is compared with its checksum before HDF5 reads it. So a rank that reads a few frames checks only the blocks
+of these frames. `add_checksums` and `find_damage` process a whole file; the ranks share the blocks. Only these two
+functions import MPI.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
 BLOCK_BYTES = 2**12
-# After the table: the number of covered bytes, and a mark.
+# What follows the table: the number of bytes that the checksums cover, and a text that shows that there is a table.
 FOOTER, MARK = struct.Struct("<Q16s"), b"eddies CRC-32 4K"
-# A file with this attribute had a table. If the table is missing, another program has cut it off.
+# A file with this attribute was written with a table. If the table is missing, the file was cut off or changed later.
 ATTRIBUTE = "checksums"
 WORDS = f"after the end of the HDF5 data: CRC-32 of every {BLOCK_BYTES} bytes, as little-endian integers of 4 bytes"
 MISSING = "its checksums are missing: the file was cut off, or another program has changed it"
 PIECE = 2**10  # blocks per read
-NAMED = 3  # datasets that an error names
+NAMED = 3  # largest number of datasets that an error names
 
 
 def open_to_read(path: str | Path) -> h5py.File:
@@ -43,7 +44,7 @@ def open_to_read(path: str | Path) -> h5py.File:
 
     Raises:
         OSError: the file cannot be opened, or its checksums are missing.
-        ProductError: bytes differ from their checksums, now or at a later read.
+        ProductError: bytes differ from their checksums, when the file is opened or at a later read.
     """
     with _opened(path) as descriptor:
         checked = _covered_bytes(descriptor) is not None
@@ -57,7 +58,7 @@ def open_to_read(path: str | Path) -> h5py.File:
 
 
 class CheckedFile:
-    """A file with checksums, for h5py.File(self, "r"). With `naming`, an error names the damaged dataset and frame."""
+    """A file object for h5py.File that checks each read. With `naming`, an error names the wrong dataset and frame."""
 
     _descriptor: int | None = None
 
@@ -101,7 +102,7 @@ def add_checksums(comm: MPI.Comm, path: Path) -> None:
     """Append checksums to a file that all ranks have closed; collective. WriteError, on all ranks, if that fails."""
     from eddies.parallel.broadcast import on_all_ranks, on_first_rank
     from eddies.parallel.reduction import global_sum
-    comm.Barrier()  # all have closed it
+    comm.Barrier()  # all ranks have closed the file
     with file_errors(path):
         size = on_first_rank(comm, lambda: path.stat().st_size)
         sums = np.zeros(_count_blocks(size), np.uint32)
@@ -188,7 +189,7 @@ def _covered_bytes(descriptor: int) -> int | None:
 
 
 def _own_pieces(comm: MPI.Comm, size: int) -> Iterator[tuple[int, memoryview]]:
-    """This rank's share of the blocks of a file, in pieces. Yields the first block of each, and a buffer for it."""
+    """Divide this rank's share of the blocks into pieces. Yields the first block of each piece, and a buffer for it."""
     from eddies.parallel.slab import block_starts
     start, stop = map(int, block_starts(_count_blocks(size), comm.size)[comm.rank:comm.rank + 2])
     buffer = memoryview(bytearray(PIECE * BLOCK_BYTES))
@@ -197,7 +198,7 @@ def _own_pieces(comm: MPI.Comm, size: int) -> Iterator[tuple[int, memoryview]]:
 
 
 def _first_wrong(descriptor: int, first: int, part: memoryview, size: int, skipped: int = 0) -> int | None:
-    """Fill `part` as `_read_sums` does. Returns the first block that differs from its checksum, or None."""
+    """Fill `part` as `_read_sums` does. Returns the number of the first wrong block, or None."""
     sums = _read_sums(descriptor, first, part, size, skipped)
     wrong = np.flatnonzero(sums != _read_table(descriptor, first, first + len(sums), size))
     return first + int(wrong[0]) if wrong.size else None
@@ -228,7 +229,7 @@ def _damage(path: Path, block: int, naming: bool = True) -> str:
 
 
 def _place(path: Path, start: int, stop: int) -> str:
-    """Names of the datasets and frames between two bytes of a file."""
+    """Names of the datasets and frames that have bytes between `start` and `stop` of a file."""
     names: list[str] = []
 
     def look(name: str, item: h5py.Group | h5py.Dataset) -> None:
@@ -247,7 +248,7 @@ def _place(path: Path, start: int, stop: int) -> str:
 
 
 def _extents(dataset: h5py.Dataset) -> Iterator[tuple[int, int, int]]:
-    """First row, offset and bytes of each contiguous part of a dataset in the file."""
+    """Yield first row, offset in the file and number of bytes of each contiguous part of a dataset."""
     if dataset.chunks is None:
         if dataset.id.get_offset() is not None:
             yield 0, dataset.id.get_offset(), dataset.nbytes

@@ -1,5 +1,5 @@
-"""Groups of arrays for programs and notebooks: an xarray Dataset that reads values when they are used or, without
-xarray, a dictionary of numpy arrays."""
+"""Groups of arrays for programs and notebooks. A group is an xarray Dataset, which reads values when they are used.
+Without xarray it is a dictionary of numpy arrays."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class ComputedArray:
 
 
 def open_group(path: Path, name: str) -> Any:
-    """The arrays of a group of a product, by name; for trajectories, the `value` of each column.
+    """The arrays of a group of a product, by name. A column of a trajectory is represented by its dataset `value`.
 
     ProductError if there is no such group or file.
     """
@@ -91,7 +91,7 @@ def computed_group(arrays: Mapping[str, ComputedArray]) -> Any:
 
 
 def groups_in(file: h5py.File) -> list[str]:
-    """The names of the groups that hold arrays, or columns of a trajectory."""
+    """The names of the groups that hold arrays, without the columns and boxes of trajectories."""
     names = []
 
     def look(name: str, item: h5py.Group | h5py.Dataset) -> None:
@@ -104,7 +104,7 @@ def groups_in(file: h5py.File) -> list[str]:
 
 
 def opened(path: Path) -> h5py.File:
-    """A product, for one process; ProductError if it cannot be opened."""
+    """Open a product in one process; ProductError if it cannot be opened."""
     try:
         return open_to_read(path)
     except OSError as error:
@@ -113,8 +113,8 @@ def opened(path: Path) -> h5py.File:
 
 
 def _dataset(arrays: Mapping[str, tuple[Any, Callable[[tuple], np.ndarray]]], attributes: Mapping[str, Any]) -> Any:
-    """An xarray Dataset of arrays, each with a function that reads a part of it. Times, ids, wavenumbers and points
-    become coordinates."""
+    """An xarray Dataset. `arrays` maps each name to an array and a function that reads a part of this array. Times,
+    ids, wavenumbers and points become coordinates."""
     variables, coordinates = {}, {}
     for key, (array, read) in arrays.items():
         axes = array.attrs.get("axes", "").split()

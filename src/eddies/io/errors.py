@@ -25,7 +25,7 @@ class WriteError(ProductError):
 
 
 def write_error(path: Path | str, error: OSError, wanted: int = 0) -> WriteError:
-    """The error for a file that cannot be written, read or removed. On a full disk, its text has the bytes wanted."""
+    """The error for a file that cannot be written, read or removed. `wanted`: bytes to write, 0 if unknown."""
     reason = error.strerror or error
     if error.errno in NO_ROOM:
         return WriteError(f"{path}: cannot be written: {reason}: {space_in_words(path, wanted)}; make room, then run "
@@ -60,6 +60,6 @@ def read_error(path: Path | str, error: OSError) -> ProductError | None:
 
 
 def remedy_for(kind: str, file: str = "it") -> str:
-    """The remedy for a product that cannot be used. Its stage would keep the file, so the user has to remove it.
-    `file` is how the sentence names it."""
+    """The remedy, in words, for a product of a `kind` that cannot be used. The stage that makes it would keep the file,
+    so the user has to remove it. `file` is the text that stands for the file."""
     return f"remove {file} and run `eddies {MAKER_OF[kind].name}` again" if kind in MAKER_OF else "make it again"

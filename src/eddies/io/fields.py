@@ -28,7 +28,7 @@ class FieldWriter:
                            for variable, components in variables.items()}
 
     def append(self, time: float, start_plane: int, variables: Mapping[str, np.ndarray]) -> None:
-        """Add a field: this rank holds planes start_plane, ... as (components, planes, y, x), or no plane."""
+        """Add a frame. `variables` holds this rank's planes start_plane, ... as (components, planes, y, x), or none."""
         append_frame(self._time, np.array(time), ())
         for variable, dataset in self._variables.items():
             append_frame(dataset, variables[variable], (0, start_plane, 0, 0))

@@ -2,12 +2,12 @@
 
 Supported layouts of other codes, with arrays [z, y, x] whose first point is the corner of the cube:
 
-- cutouts of the Johns Hopkins Turbulence Databases (JHTDB), as pyJHTDB, giverny and givernylocal write them:
-  `Velocity_0001` or `velocity_0001`, ... (z, y, x, component), numbered in time, and the points of each axis in
-  `xcoor`, `ycoor` and `zcoor`, of a cube of edge 2 pi. The points show whether the cutout is the whole cube. The value
-  -999.9 marks points that the database did not deliver.
-- files `state_phys*.h5` and `.nc` of fluidsim: `state_phys/vx`, `vy` and `vz` (z, y, x) and the attributes `Lx`, `Ly`,
-  `Lz` of `info_simul/params/oper`.
+- cutouts of the Johns Hopkins Turbulence Databases (JHTDB), as pyJHTDB, giverny and givernylocal write them. The
+  velocities are `Velocity_0001` or `velocity_0001`, ... (z, y, x, component), numbered in time. The value -999.9 marks
+  points that the database did not deliver. `xcoor`, `ycoor` and `zcoor` hold the coordinates along each axis. They show
+  whether the cutout is the whole cube, which has the edge 2 pi.
+- files `state_phys*.h5` and `.nc` of fluidsim. The velocities are `state_phys/vx`, `vy` and `vz` (z, y, x). The
+  attributes `Lx`, `Ly`, `Lz` of `info_simul/params/oper` are the edges of the box.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ class StoredStates(FieldSeries):
 class VelocityCubes:
     """Velocities of another code at one or more times, with the interface of `FieldSeries`.
 
-    `states` holds, for each time, one dataset (z, y, x, component) or three datasets (z, y, x). ProductError if they
-    are not velocities with the same number of points along each axis.
+    `states` holds, for each time, one dataset (z, y, x, component) or three datasets (z, y, x). ProductError if the
+    datasets are not velocities with the same number of points along each axis.
     """
 
     variables, sound_speed = ("velocity",), None
@@ -82,11 +82,11 @@ class VelocityCubes:
         return len(self._states)
 
     def read(self, index: int, variable: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Planes start, ..., stop - 1 of the velocity, (3, stop - start, y, x). ProductError if a value is damaged."""
+        """Planes start, ..., stop - 1 of the velocity, (3, stop - start, y, x). ProductError if one is damaged."""
         return np.concatenate([_read_planes(dataset, start, stop) for dataset in self._states[index]])
 
     def check(self, comm: MPI.Comm, index: int, velocity: np.ndarray) -> None:
-        """Raise ProductError if `velocity`, the planes of this rank, cannot be that of a flow; collective."""
+        """Raise ProductError if `velocity`, on this rank's planes, is uniform, too large or incomplete; collective."""
         dataset = self._states[index][0]
         own = [np.ravel(dataset.attrs[name]) for name in FILL_ATTRIBUTES if name in dataset.attrs]
         fills = dict.fromkeys([*NOT_DELIVERED, *(float(value[0]) for value in own
@@ -109,7 +109,7 @@ class VelocityCubes:
 
 @contextmanager
 def open_states(comm: MPI.Comm, path: Path) -> Iterator[StoredStates | VelocityCubes]:
-    """The states of the whole flow in a file; all ranks call it, and if one cannot read it, all raise ProductError.
+    """The states of the whole flow in a file; collective. If one rank cannot read it, all ranks raise ProductError.
 
     A ground truth with tracers holds states at a few times; one without tracers holds only its last state.
     """
@@ -179,7 +179,7 @@ def _fluidsim_state(file: h5py.File) -> VelocityCubes:
     cubes = VelocityCubes([[_dataset(file, f"state_phys/v{axis}") for axis in "xyz"]])
     parameters = file.get(FLUIDSIM_PARAMETERS)
     try:
-        # Newer versions write arrays of one element.
+        # Newer versions of fluidsim write arrays of one element.
         edges = [float(np.asarray(parameters.attrs[f"L{axis}"]).item()) for axis in "xyz"]
     except (AttributeError, KeyError, TypeError, ValueError):
         raise ProductError(f"{file.filename}: {FLUIDSIM_PARAMETERS} has no numbers Lx, Ly, Lz, the edges of the box; "

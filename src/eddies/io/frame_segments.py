@@ -1,4 +1,4 @@
-"""Frames in segments: files that are closed at each checkpoint, so that a later failure cannot damage them."""
+"""Segments: files of frames. They are closed at each checkpoint, so that a later failure cannot damage them."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class FrameLayout:
 
     def writers(self, file: File, names: Mapping[str, str], images: bool = False
                 ) -> tuple[dict[str, TrajectoryWriter], dict[str, FieldWriter]]:
-        """Writers of the trajectories and of the fields in `names`; collective. `names` maps them to their names in the
-        file. `images` adds the column `image` to trajectories with positions."""
+        """Writers of trajectories and writers of fields, each by name; collective. `names` maps the series that get a
+        writer to their names in the file. `images` adds the column `image` to trajectories with positions."""
         return ({name: TrajectoryWriter(file, names[name], series.total, self.length, series.columns, self.dtype,
                                         images and "position" in series.columns)
                  for name, series in self.trajectories.items() if name in names},
@@ -70,7 +70,7 @@ class FrameSegments:
         self._name, self._file = "", ExitStack()
 
     def open(self, step: int) -> None:
-        """Begin a segment, unless one is open. Its writers are `trajectories` and `fields`, by name."""
+        """Begin a segment, unless one is open. The attributes `trajectories` and `fields` hold its writers by name."""
         if self._name:
             return
         in_files(self.comm, self.directory, lambda: self.directory.mkdir(exist_ok=True))
@@ -86,9 +86,9 @@ class FrameSegments:
             self._name = ""
 
     def first_frames(self, name: str, count: int) -> list[tuple[float, dict[str, np.ndarray]]]:
-        """Time and columns of the first `count` frames of a trajectory of the closed segments, in this rank's block."""
+        """Time and columns of the first `count` frames of a trajectory in closed segments; only this rank's rows."""
         frames: list[tuple[float, dict[str, np.ndarray]]] = []
-        for segment in self.names[:count]:  # each holds one frame or more
+        for segment in self.names[:count]:  # each segment holds one frame or more
             with open_product(self.comm, self.directory / segment, None) as file:
                 stored = Trajectory(file, name)
                 frames += [(time, self._values(stored, frame)) for frame, time in enumerate(stored.times[:count])]

@@ -45,7 +45,7 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
 
     `provenance` (the scene's text, its fingerprint, ...; JSON-able) is stored with the versions of all libraries, the
     number of ranks, the date and an id. Its `made_from` lists kinds of products; the ids of such products in the same
-    directory are stored. An `id` in `provenance` is kept: the file then replaces one from which others were made.
+    directory are stored. An `id` in `provenance` is kept, for a file that replaces one from which others were made.
 
     Raises:
         WriteError: on all ranks; the file cannot be written or renamed.
@@ -65,7 +65,7 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
 
 @contextmanager
 def open_product(comm: MPI.Comm, path: str | Path, kind: str | None) -> Iterator[h5py.File]:
-    """Read a complete product of a kind, or of any kind if it is None. If one rank cannot open it, all ranks raise.
+    """Open a complete product to read it. `kind` None allows any kind. If one rank cannot open it, all ranks raise.
 
     Raises:
         ProductError: the file is missing, truncated, not an HDF5 file, unfinished, or of another kind or format.
@@ -114,8 +114,9 @@ def find_group(file: h5py.Group, name: str) -> h5py.Group:
 
 
 def stored_numbers(file: h5py.File) -> Iterator[tuple[str, int | None, np.ndarray]]:
-    """Place, frame and values of the floating-point numbers of an open product: the last frame of each series, and all
-    other numbers, whose frame is None.
+    """Yield place, frame and values of the floating-point numbers of an open product.
+
+    A series gives only its last frame. For all other numbers, attributes included, the frame is None.
     """
     names: list[str] = []
     file.visit(names.append)
@@ -173,8 +174,8 @@ def write_block(dataset: h5py.Dataset, block: np.ndarray, offset: tuple[int, ...
 def read_frame(dataset: h5py.Dataset, frame: int, selection: tuple[slice, ...], limit: float = np.inf) -> np.ndarray:
     """A part of a frame of floating-point numbers.
 
-    ProductError, on this rank, if a number is outside the range 0 to `limit`, where a limit is given, or is not finite.
-    In a rollout, which may end with numbers that are not finite, they are no error.
+    ProductError, on this rank, if a number is not finite or, with a finite `limit`, is outside the range 0 to `limit`.
+    A rollout may end with numbers that are not finite, and there they are no error.
     """
     values, kind = dataset[frame, *selection], dataset.file.attrs["kind"]
     place = f"frame {frame % len(dataset)}: holds values that are"

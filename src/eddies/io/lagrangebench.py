@@ -1,8 +1,8 @@
 """Trajectories as a data set for learned particle simulators, in the layout of LagrangeBench.
 
 Layout: Toshev et al., NeurIPS 2023, Datasets and Benchmarks. A directory holds train.h5, valid.h5 and test.h5, each
-with a trajectory `00000` of consecutive frames, and metadata.json. Velocities and accelerations are differences between
-frames, in units of length.
+with a trajectory `00000` of consecutive frames, and metadata.json. Velocities and accelerations are first and second
+differences of positions between frames, so they have the unit of length.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from eddies.io.trajectories import Trajectory
 SPLITS = ("train", "valid", "test")
 FRAMES_OF_A_SPLIT = 3  # smallest number, because an acceleration needs three frames
 FLUID = 0  # the type of all particles
-CONNECTIVITY = 1.45  # radius of pairs in the data sets of LagrangeBench, in mean distances between particles
-SMALLEST_DEVIATION = 1e-7  # a smaller standard deviation is stored as 1: the reader divides by it
+CONNECTIVITY = 1.45  # radius of pairs in the data sets of LagrangeBench, divided by the mean distance of particles
+SMALLEST_DEVIATION = 1e-7  # a smaller standard deviation is stored as 1, because LagrangeBench divides by it
 
 
 def split_frames(frames: int) -> list[int]:
@@ -65,7 +65,7 @@ def write_dataset(directory: Path, trajectory: Trajectory, case: str, provenance
 
 
 def _copy_frames(trajectory: Trajectory, start: int, positions: h5py.Dataset) -> np.ndarray:
-    """Copy frames from `start` on. Returns for velocity and acceleration the mean and mean square, (2, 2, 3)."""
+    """Copy frames from `start` on. Returns (velocity or acceleration, mean or mean square, component), (2, 2, 3)."""
     length, sums, before, velocity_before = trajectory.length, np.zeros((2, 2, 3)), None, None
     for row in range(len(positions)):
         stored = trajectory.read(start + row, "position").astype(np.float32)

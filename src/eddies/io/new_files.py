@@ -17,8 +17,8 @@ Two measures prevent this, and a third is for an h5py that is built without MPI,
 3. Without MPI in h5py, rank 0 writes for all: `own_part` sends it the blocks of the other ranks. The other ranks have
    a file in memory with the same groups, attributes and shapes, so callers see no difference.
 
-A job may lose its run directory to another one (io/run_lock.py), which then writes a NAME.partial of its own. So a file
-is renamed or removed only if it still is the file that this job created.
+A job may lose its run directory to another job (io/run_lock.py), which then writes a NAME.partial of its own. So a job
+renames or removes a file only if it is still the file that this job created.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from eddies.io.run_lock import RunTakenOver
 from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank
 from eddies.parallel.stop import Stopped
 
-# Upper limits of what HDF5 writes beside the values: for a dataset, for a chunk, and when it closes a file.
+# Upper limits of the bytes that HDF5 adds to the values: for a dataset, for a chunk, and when it closes a file.
 HEADER_BYTES, INDEX_BYTES, MARGIN_BYTES = 2**14, 2**8, 2**19
 # Largest product if rank 0 writes for all. Rank 0 then holds one frame in memory, and the other ranks wait.
 LARGEST_BYTES = 4 * 10**9
@@ -55,7 +55,7 @@ Layout = Mapping[str, tuple[tuple[int, ...], Any]]  # shape and type of each lar
 
 # The files that are being written, by their names in HDF5.
 _open: dict[str, _NewFile] = {}
-# Files left open after an error, until the process ends: HDF5 would crash, or one rank would wait for the others.
+# Files that stay open after an error until the process ends. If one were closed, HDF5 would crash or a rank would wait.
 _abandoned: list[_NewFile] = []
 
 
@@ -121,7 +121,7 @@ def create_export(path: Path, layout: Layout, provenance: Mapping[str, Any], ove
         path.parent.mkdir(parents=True, exist_ok=True)
     size = sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in layout.values())
     with new_file(MPI.COMM_SELF, path, checksums=False) as file:
-        with writing(file, size + overhead):  # the margin suffices for the rest
+        with writing(file, size + overhead):  # the margin has room for headers and attributes
             file.attrs["provenance"] = json.dumps(dict(provenance))
             for name, (shape, dtype) in layout.items():
                 file.create_dataset(name, shape, dtype)
@@ -130,7 +130,7 @@ def create_export(path: Path, layout: Layout, provenance: Mapping[str, Any], ove
 
 @contextmanager
 def writing(group: h5py.Group | h5py.Dataset, size: int) -> Iterator[None]:
-    """Inside the block the caller writes at most `size` bytes to a new file. `size` is the same on all ranks.
+    """Reserve `size` bytes of a new file, which the caller may write inside the block. `size` is equal on all ranks.
 
     Raises:
         WriteError: on all ranks; the disk is full.
@@ -160,7 +160,7 @@ def own_part(group: h5py.Group | h5py.Dataset, shape: tuple[int, ...], block: np
              offset: tuple[int, ...]) -> tuple[np.ndarray, tuple[int, ...]]:
     """The part of an array of this `shape` that this rank writes, and the offset of the part; collective.
 
-    The part is the rank's block. If rank 0 writes for all, it is the whole array on rank 0, and empty on other ranks.
+    The part is the rank's block. If rank 0 writes for all, the part is the whole array on rank 0, and empty on others.
     """
     comm = _open[group.file.filename].comm
     if not has_single_writer(comm) or not shape:
@@ -183,7 +183,7 @@ def own_part(group: h5py.Group | h5py.Dataset, shape: tuple[int, ...], block: np
 
 
 def frame_bytes(dataset: h5py.Dataset) -> int:
-    """The bytes that a file grows by if a chunked dataset gets another row."""
+    """The most bytes by which a file grows if a chunked dataset gets one more frame."""
     if dataset.shape[0] % dataset.chunks[0]:
         return 0
     chunks = math.prod(-(-extent // chunk) for extent, chunk in zip(dataset.shape[1:], dataset.chunks[1:]))
@@ -192,7 +192,7 @@ def frame_bytes(dataset: h5py.Dataset) -> int:
 
 class _NewFile:
     """An HDF5 file that all ranks write together. `reserve`, `close` and `try_to_close` are collective; only rank 0
-    calls the other methods."""
+    calls `is_own`, `remove` and `publish`."""
 
     def __init__(self, comm: MPI.Comm, path: Path) -> None:
         self.comm, self.path, self.broken = comm, path, False
@@ -204,7 +204,7 @@ class _NewFile:
         _open[self.name] = self
 
     def reserve(self, size: int) -> None:
-        """Reserve space for `size` more bytes than earlier calls. WriteError, on all ranks, if there is too little."""
+        """Reserve space for `size` bytes more than before. WriteError, on all ranks, if there is too little."""
         self._needed += size
         if self._needed + MARGIN_BYTES > self._reserved:
             stop = self._needed + 2 * MARGIN_BYTES
@@ -219,7 +219,7 @@ class _NewFile:
             self._stream.close()
 
     def try_to_close(self) -> bool:
-        """Close the file after an error, without raising another one. Returns whether all ranks have closed it."""
+        """Close the file after an error, without raising another error. Returns whether all ranks have closed it."""
         complaint = None
         try:
             self.close()
@@ -242,7 +242,7 @@ class _NewFile:
         if not self.is_own():
             raise RunTakenOver(path)
         os.replace(self.path, path)
-        with suppress(OSError):  # the file is complete; some file systems refuse this for a directory
+        with suppress(OSError):  # the file is complete; some file systems do not allow fsync of a directory
             _force_to_disk(path.parent)
 
     def _make_empty(self) -> None:
@@ -251,7 +251,7 @@ class _NewFile:
             empty = io.BytesIO()
             h5py.File(empty, "w").close()
             try:
-                # A new inode: another job, or a file that was left open after an error, may have this one open.
+                # Make a new inode: another job, or a file left open after an error, may still use the old one.
                 self.path.unlink(missing_ok=True)
                 self.path.write_bytes(empty.getvalue())
             except OSError:

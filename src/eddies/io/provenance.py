@@ -20,19 +20,20 @@ from eddies.io.errors import ProductError
 from eddies.kernels.library import in_use
 from eddies.pipeline import MAKER_OF
 
-# The format of products; other formats are not read. Format 1 (eddies 0.1) is not stored in the file. Since format
-# 2, scales are those at the release, and a model is a list of terms. Since format 3, the filter width has its own name.
+# The format of products; other formats are not read. Files of format 1 (eddies 0.1) do not name their format. Since
+# format 2, scales are those at the release of the tracers, and a model is a list of terms. Since format 3, the filter
+# width has the name `filter_width`.
 FORMAT = 3
 LIBRARIES = ("numpy", "mpi4py", "h5py", "pyfftw", "torch")
 
 
 def environment(ranks: int) -> dict[str, object]:
-    """Versions of this package and its libraries, the commit of the checkout, number of ranks, date."""
+    """Versions of this package and its libraries, commit of the checkout, kernels in use, number of ranks, date."""
     return {"eddies": eddies.__version__, "commit": commit(), "libraries": versions(), "kernels": in_use(),
             "ranks": ranks, "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")}
 
 
-@functools.cache  # it reads long files of the installation
+@functools.cache  # finding the versions reads long files of the installation
 def versions() -> dict[str, str]:
     """Versions of Python, HDF5, MPI and the installed libraries."""
     found = {"python": platform.python_version(), "hdf5": h5py.version.hdf5_version,
@@ -62,7 +63,7 @@ def commit() -> str | None:
 
 
 def identity(directory: Path, kinds: Iterable[str]) -> dict[str, Any]:
-    """A new `id`, and `made_from`: the ids of the products of these kinds in a directory. Old products have id None."""
+    """A new `id`, and `made_from`: the ids, by kind, of such products in a directory. Old products have the id None."""
     beside = {kind: product_provenance(directory / MAKER_OF[kind].file) for kind in kinds}
     return {"id": uuid.uuid4().hex, "made_from": {kind: origin.get("id") for kind, origin in beside.items() if origin}}
 
@@ -83,8 +84,8 @@ def product_fingerprint(path: str | Path) -> str | None:
 
 
 def others_trained_on(origin: Mapping[str, Any]) -> list[str]:
-    """The ground truths that a model was trained on; empty if the ground truth of its own run is among them. `origin`
-    is the model's provenance."""
+    """Paths of the ground truths that a model was trained on; empty if the ground truth of its own run is among them.
+    `origin` is the model's provenance."""
     truths = origin.get("truths", {})
     return [] if origin.get("made_from", {}).get("ground_truth") in truths.values() else list(truths)
 
@@ -92,7 +93,7 @@ def others_trained_on(origin: Mapping[str, Any]) -> list[str]:
 def read_provenance(file: h5py.File) -> dict[str, Any]:
     """Scene text, fingerprint, versions, ranks, date, id and `made_from` of an open product; old products have no id.
 
-    Raises ProductError if the attribute is damaged.
+    Raises ProductError if the provenance is damaged.
     """
     found = read_json(file, "provenance")
     whole = {"eddies", "commit", "libraries", "ranks", "date"} <= found.keys()

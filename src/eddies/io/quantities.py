@@ -40,7 +40,7 @@ class Quantity(NamedTuple):
 
 PARTICLES, FIELD, ROW = "time particle", "time component z y x", "row"
 POINTS = "at the points i edge / cells of the periodic cube, i = 0, 1, ..."
-# Quantities by path in the file; the first match counts.
+# Quantities by pattern of the path in the file; the first pattern that matches counts.
 QUANTITIES = {
     "particles/tracks/track/value": Quantity("1", PARTICLES, "number of the track in each row; -1: no track"),
     "particles/tracks/coordinates/value": Quantity("L", f"{PARTICLES} xyz", "position in the file of the tracks"),

@@ -33,7 +33,7 @@ log = logging.getLogger("eddies")
 LOCK = "LOCK"
 SIGN_SECONDS = 30.0
 STALE_SECONDS = 300.0  # ten missed signs of life, as on a file system that hangs for a while
-SETTLE_SECONDS = 0.5  # time for other jobs that have found the same stale lock to replace it, too
+SETTLE_SECONDS = 0.5  # within this time, other jobs that have found the same stale lock replace it, too
 UNREADABLE = "unknown"
 
 
@@ -96,7 +96,7 @@ class Holder:
 
 @dataclass(frozen=True)
 class FoundLock:
-    """A lock in a directory, with the last sign of life by the clock of the file system."""
+    """A lock in a directory. `sign` is the time of the last sign of life by the clock of the file system."""
 
     holder: Holder
     directory: Path
@@ -109,14 +109,14 @@ class FoundLock:
 
     @property
     def stale(self) -> bool:
-        """Whether the job has ended or, if that is unknown, has given no sign of life for long."""
+        """Whether the job has ended or, if that is unknown, has given no sign of life for STALE_SECONDS."""
         lives = self.holder.lives()
         return self.silent > STALE_SECONDS if lives is None else not lives
 
 
 class RunLock:
-    """The lock that this job holds, on rank 0. A thread gives signs of life. A directory that the job has `made` is
-    removed at the end if it is empty."""
+    """The lock that this job holds, on rank 0. A thread gives signs of life. `made` says whether the job has made the
+    directory; if so, `release` removes an empty directory."""
 
     def __init__(self, directory: Path, holder: Holder, made: bool) -> None:
         self.directory, self.path, self.holder, self.made = directory, directory / LOCK, holder, made
@@ -158,9 +158,10 @@ class RunLock:
 
 @contextlib.contextmanager
 def lock_directory(comm: MPI.Comm, directory: Path, take_over: bool = False) -> Iterator[LockLoss]:
-    """Hold a run directory, which is made if it is missing; collective. Yields `RunLock.lock_lost` of rank 0.
+    """Hold a run directory, which is made if it is missing; collective.
 
-    A stale lock is replaced. With `take_over`, any lock is replaced; its job then ends at its next step.
+    Yields `RunLock.lock_lost` on rank 0, and on other ranks a function that returns None. A stale lock is replaced.
+    With `take_over`, any lock is replaced; the job that held the directory then ends at its next step.
 
     Raises:
         RunInUse: another job works there.
@@ -231,7 +232,7 @@ def _take(directory: Path, take_over: bool) -> RunLock:
 
 
 def _write(path: Path, holder: Holder) -> None:
-    """Write a new lock; FileExistsError if there is one."""
+    """Write a new lock; FileExistsError if the file exists."""
     content = f"{json.dumps(asdict(holder))}\n".encode()
     with open(path, "xb", buffering=0) as file:
         try:
@@ -255,7 +256,7 @@ def _is_held_by(path: Path, holder: Holder) -> bool:
 
 
 def _read(path: Path) -> Holder:
-    """The job that a lock names; one with the name UNREADABLE if the content is incomplete or cannot be read."""
+    """The job that a lock names; a job with the name UNREADABLE if the content is incomplete or cannot be read."""
     try:
         return Holder(**json.loads(path.read_text()))
     except (FileNotFoundError, NotADirectoryError):
@@ -273,7 +274,7 @@ def _machine() -> str:
 
 
 def _born(pid: int) -> str:
-    """Start time of a process of this machine; empty if it has ended, or is unknown."""
+    """Start time of a process of this machine; empty if the process has ended or the time is unknown."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:

@@ -1,9 +1,9 @@
-"""Particle tracks of experiments and other programs: read four layouts, write one.
+"""Particle tracks of experiments and other programs, read in four layouts and written in one.
 
 A track is the path of one particle. Tracks are kept as rows, one for each particle and time, sorted by time. Layouts:
 
-- "h5md": H5MD 1.1 (de Buyl, Colberg & Höfling, Comput. Phys. Commun. 185, 1546), also the trajectories of eddies:
-  /particles/GROUP with `position`, `velocity` and `id`. An id below 0 marks a row without a particle.
+- "h5md": H5MD 1.1 (de Buyl, Colberg & Höfling, Comput. Phys. Commun. 185, 1546), which eddies uses for trajectories.
+  /particles/GROUP holds `position`, `velocity` and `id`. An id below 0 marks a row without a particle.
 - "npz": NumPy arrays `pos` and `vel` (frames, particles, 3) and `rho` (frames, particles), as published with Tian et
   al. (2023), with the times in `time` (frames,) if the file has them.
 - "lagrangebench": TRAJECTORY/position (frames, particles, 3) and metadata.json beside the file (Toshev et al. 2023).
@@ -61,7 +61,7 @@ class Tracks:
         return {name: values for name, values in found.items() if values is not None}
 
     def chosen(self, rows: np.ndarray) -> Tracks:
-        """The tracks with these rows only; `rows` holds numbers or a mask."""
+        """The tracks with these rows only; `rows` holds row numbers or a boolean mask."""
         return replace(self, **{name: values[rows] for name, values in self.columns.items()})
 
     @cached_property
@@ -71,13 +71,14 @@ class Tracks:
 
     @cached_property
     def starts(self) -> np.ndarray:
-        """First row of each frame, and the number of rows, (frames + 1,)."""
+        """First row of each frame and, at the end, the number of rows, (frames + 1,)."""
         return np.append(np.searchsorted(self.time, self.times), len(self.time))
 
     def displacements(self, edge: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """All m pairs of successive rows of a track: first rows (m,), displacements (m, 3) and intervals (m,).
+        """Displacements between successive rows of each track; m is the number of such pairs of rows.
 
-        `edge` is that of a periodic cube, in which displacements lead to the nearest image, or None without a cube.
+        Returns first row of each pair (m,), displacement (m, 3) and time interval (m,). `edge` is the edge of a
+        periodic cube, in which a displacement leads to the nearest image, or None without a cube.
         """
         order = np.lexsort((self.time, self.track))
         same = self.track[order[1:]] == self.track[order[:-1]]
@@ -99,8 +100,8 @@ def read_tracks(path: str | Path, layout: str | None = None, group: str | None =
     interval : time between frames, for an NPZ file without times.
 
     Raises:
-        ProductError: the file is missing or cannot be read, has another layout, or holds tracks that are not finite or
-            incomplete, or a track twice at one time.
+        ProductError: the file is missing or cannot be read, has another layout, lacks values, holds values that are
+            not finite, or holds a track twice at one time.
     """
     path = Path(path)
     if not path.is_file():
@@ -123,7 +124,7 @@ def write_tracks(path: str | Path, times: Any, ids: Any, positions: Any, velocit
 
     Parameters
     ----------
-    times, ids : time and number of the track of each row, (rows,). Ids are at least 0.
+    times, ids : time and track id of each row, (rows,). Ids are at least 0.
     positions, velocities : (rows, 3); velocities may be None.
     edge : edge of the periodic cube.
 
@@ -159,7 +160,7 @@ def write_tracks(path: str | Path, times: Any, ids: Any, positions: Any, velocit
 
 
 def _layout_of(path: Path) -> str:
-    """The layout of a file by its suffix; an HDF5 file without /particles is one of LagrangeBench."""
+    """The layout of a file by its suffix. An HDF5 file is "h5md" if it has /particles, else "lagrangebench"."""
     suffix = path.suffix.lower()
     if suffix in (".h5", ".hdf5", ".h5md"):
         with _opened(path) as file:
@@ -263,7 +264,7 @@ def _chosen(path: Path, holder: Mapping[str, Any], name: str | None, what: str) 
 
 def _from_frames(times: np.ndarray, ids: np.ndarray, position: np.ndarray, velocity: np.ndarray | None,
                  density: np.ndarray | None = None, edge: float | None = None) -> Tracks:
-    """Rows from arrays over frames and particles; rows with an id below 0 are left out."""
+    """Tracks from arrays (frames, particles, ...) and `times` (frames,). Entries with an id below 0 are left out."""
     if position.ndim != 3 or position.shape[2] != 3:
         raise ValueError(f"positions have the shape {position.shape}, not (frames, particles, 3)")
     for name, values, shape in (("times", times, position.shape[:1]), ("ids", ids, position.shape[:2]),
@@ -311,9 +312,9 @@ def checked(tracks: Tracks, path: Path) -> Tracks:
 
 
 def check_inside(tracks: Tracks, lower: np.ndarray, upper: np.ndarray, key: str, path: str | Path) -> None:
-    """Raise ProductError if positions are outside the box or volume from `lower` to `upper`, the value of `key`.
+    """Raise ProductError if positions are outside the region from `lower` to `upper`: the unit of length is wrong.
 
-    The unit of length is then wrong.
+    `key` is the key of the scene that gives the region, "box" or "volume".
     """
     margin = ROUNDING * (upper - lower)
     outside = np.flatnonzero(((tracks.position < lower - margin) | (tracks.position > upper + margin)).any(1))
@@ -326,8 +327,8 @@ def check_inside(tracks: Tracks, lower: np.ndarray, upper: np.ndarray, key: str,
 
 
 def check_velocities(tracks: Tracks, edge: float | None, path: str | Path) -> None:
-    """Raise ProductError if velocities contradict displacements: the unit of length or time is wrong. `edge` is that
-    of the periodic cube, or None."""
+    """Raise ProductError if velocities contradict displacements: the unit of length or time is wrong. `edge` is the
+    edge of the periodic cube, or None."""
     if tracks.velocity is None:
         return
     first, moved, interval = tracks.displacements(edge)

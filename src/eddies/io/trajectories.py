@@ -17,7 +17,7 @@ from eddies.io.hdf5 import (append_frame, find_group, growing_dataset, read_fram
 
 IMAGE = "image"
 UNITS = {"position": "Angstrom", "velocity": "Angstrom ps-1"}
-ROUNDING = 1e-6  # relative, of positions in single precision
+ROUNDING = 1e-6  # relative rounding error of positions in single precision
 
 
 class TrajectoryWriter:
@@ -57,7 +57,7 @@ class TrajectoryWriter:
             self._columns[IMAGE] = self._element(IMAGE, (total, 3), np.int16)
 
     def append(self, step: int, time: float, start: int, columns: Mapping[str, np.ndarray]) -> None:
-        """Add a frame: this rank holds rows start, start + 1, ... of every column, by id, or no row."""
+        """Add a frame. `columns` holds this rank's rows start, start + 1, ... of every column by name, or no row."""
         append_frame(self._step, np.array(step), ())
         append_frame(self._time, np.array(time), ())
         append_frame(self._edges, np.diag([self._length] * 3), (0, 0))
@@ -68,7 +68,7 @@ class TrajectoryWriter:
 
     def _element(self, column: str, frame_shape: tuple[int, ...], dtype: str | np.dtype) -> h5py.Dataset:
         element = self._group.create_group(column)
-        # Hard links: all columns share their times.
+        # Hard links: all columns share the steps and times.
         element["step"], element["time"] = self._step, self._time
         values = growing_dataset(element, "value", frame_shape, dtype)
         if column in UNITS:
@@ -76,7 +76,7 @@ class TrajectoryWriter:
         return values
 
     def _count_images(self, position: np.ndarray) -> np.ndarray:
-        """The images (n, 3) of this rank's particles at the wrapped positions (n, 3) of the next frame."""
+        """Return the images (n, 3) of this rank's particles in the next frame, whose wrapped positions are (n, 3)."""
         left = np.zeros_like(position) if self._before is None else np.rint((self._before - position) / self._length)
         # A rollout may end with positions that are not finite.
         self._image = self._image + np.nan_to_num(left, posinf=0, neginf=0).astype(np.int16)

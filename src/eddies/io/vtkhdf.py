@@ -20,7 +20,7 @@ from eddies.io.new_files import Layout, create_export
 from eddies.io.trajectories import Trajectory
 
 VERSION = (2, 0)
-BLOCK_BYTES = 2**26  # of a field in memory at once
+BLOCK_BYTES = 2**26  # the most bytes of a field that are in memory at once
 STEP_BYTES = 2**10  # upper limit of the bytes of a step outside the large datasets
 
 
@@ -85,7 +85,7 @@ def _create(path: Path, kind: str, frames: int, layout: Layout,
 
 
 def _write_steps(root: h5py.Group, times: np.ndarray, offsets: Mapping[str, np.ndarray]) -> None:
-    """Write the times of the steps, and their offsets in each dataset."""
+    """Write the times of the steps, and the offset of each step in each dataset. A single time is field data."""
     if len(times) == 1:
         root["FieldData/time"] = times
         return
@@ -96,7 +96,7 @@ def _write_steps(root: h5py.Group, times: np.ndarray, offsets: Mapping[str, np.n
 
 
 def _copy_field(series: FieldSeries, frame: int, variable: str, dataset: h5py.Dataset) -> None:
-    """Copy (components, z, y, x) to (z, y, x, components), and repeat the first planes at the end of each axis."""
+    """Copy (components, z, y, x) to (z, y, x, components), and repeat the first plane of each axis at its end."""
     cells, frames = series.cells, len(series.times)
     step = () if frames == 1 else (frame,)
     blocks = math.ceil(dataset.nbytes / frames / BLOCK_BYTES)

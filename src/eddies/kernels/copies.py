@@ -2,7 +2,7 @@
 
 Along an axis of `cells` points a transform keeps the modes 0 ... K, -K ... -1, at both ends of its arrays. The gap
 between them stays zero. Arrays that are used many times are passed to `described` once, because numpy returns addresses
-slowly. They must be contiguous and of the given precision; ValueError otherwise.
+slowly. Arrays must be contiguous and of the given precision; ValueError otherwise.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from eddies.kernels.library import ADDRESS, INT, NUMBER, members, require
 
 
 class _Blocks(ctypes.Structure):
-    """Blocks (components, planes, lines, width) that follow each other along axis 1 or 2."""
+    """Blocks (components, planes, lines, width), the successive parts of one array along axis 1 or 2."""
 
     _fields_ = members(INT, "ranks planes lines width") + members(ADDRESS, "addresses starts")
 
@@ -34,7 +34,8 @@ class _Blocks(ctypes.Structure):
 class _Array:
     """An array with its address, shape and strides.
 
-    It is contiguous or, with `gaps`, consists of contiguous parts `apart` elements from each other.
+    The array is contiguous. With `gaps`, only its parts along the first axis need to be contiguous. `apart` is the
+    number of elements from the beginning of one part to the next.
     """
 
     def __init__(self, array: np.ndarray, gaps: bool = False) -> None:
@@ -70,8 +71,8 @@ class _Copies:
 class ColumnCopies(_Copies):
     """Copies between modes, columns and blocks for transforms along z.
 
-    Modes have shape (c, kz, y, x). Columns (z, rows, x) hold some rows of y of one component, and may have gaps between
-    successive z. Blocks (c, z, y, x) are what ranks exchange; they follow each other in z.
+    Modes have shape (c, kz, y, x). A column (z, rows, x) holds one component at some values of y, the rows, and may
+    have gaps between successive z. The ranks exchange blocks (c, z, y, x), which are successive parts along z.
     """
 
     exchanged_axis = 1
@@ -115,11 +116,11 @@ class ColumnCopies(_Copies):
 class PlaneCopies(_Copies):
     """Copies between blocks, packed modes and planes for transforms in (y, x).
 
-    Blocks (c, planes, y, x) hold the modes with kx >= 0 that ranks exchange; they follow each other in y. Two real
-    planes f and g, half a block of planes apart, are transformed as one complex plane f + i g. Its packed modes
-    (c, pairs, ky, kx) hold kx = 0 ... K, -K ... -1. The number of planes is even, or one: a single plane is its own
-    partner. Because of round-off, modes with kx = 0 and their mirror images may not be exactly conjugate, so their mean
-    is taken.
+    The ranks exchange blocks (c, planes, y, x) of the modes with kx >= 0, which are successive parts along y. Two real
+    planes f and g are transformed as one complex plane f + i g. Of the planes that are transformed together, f is in
+    the first half, and g has the same place in the second half. The packed modes (c, pairs, ky, kx) of f + i g hold
+    kx = 0 ... K, -K ... -1. The number of planes is even, or one: a single plane is its own partner. Because of
+    round-off, modes with kx = 0 and their mirror images may not be exactly conjugate, so their mean is taken.
     """
 
     exchanged_axis = 2

@@ -24,7 +24,7 @@ class Formulas:
     """Formulas for fields (c, ...) at grid points and for modes (c, kz, ky, kx) with the given wavevectors.
 
     A term of a sum is a pair (factors, state). Factors have the shape (kz, ky, n, kx) and are stored for kz >= 0 only,
-    because they are equal for kz and -kz. Arrays must have the grid's precision. Modes must be
+    because they are equal for kz and -kz. Arrays must have the precision of the wavevectors. Modes must be
     contiguous, and so must each field; ValueError otherwise.
     """
 

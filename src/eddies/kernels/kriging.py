@@ -9,8 +9,8 @@ import numpy as np
 
 from eddies.kernels.library import ADDRESS, INT, NUMBER, address, members, require
 
-# Largest number of neighbours of a receiver. With so many neighbours, the equations of the receivers that are solved
-# together, up to 16, take 64 MB in single precision.
+# Largest number of neighbours of a receiver. The equations of up to 16 receivers are solved together; with this number
+# of neighbours they take 64 MB in single precision.
 MOST_NEIGHBORS = 1024
 
 
@@ -38,7 +38,7 @@ def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.
     displacement : (3, m), x_i - x_j, contiguous, in single or double precision.
     support : distance beyond which a receiver has no neighbours.
     noise : variance of the part of a value that does not belong to the field.
-    slowest, amplitudes : of the covariance sum_m amplitudes[m] exp(-slowest 2^m r^2), at most eight terms.
+    slowest, amplitudes : parameters of the covariance sum_k amplitudes[k] exp(-slowest 2^k r^2), at most eight terms.
     sited : whether receivers are particles, so that their own values count.
     """
     dtype, pairs = displacement.dtype, displacement.shape[-1]

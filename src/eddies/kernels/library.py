@@ -96,8 +96,8 @@ def share_threads() -> None:
 def keep_freed_memory() -> None:
     """Keep freed memory in this process instead of returning it to the system.
 
-    Otherwise new pages took a sixth of the time of a turnover of 32^3 particles with kriging. Does nothing if the
-    user has set MALLOC_... variables, or with a C library other than glibc.
+    Otherwise the system spent a sixth of the wall time on new pages of memory, in a run of 32^3 particles with kriging.
+    Does nothing if the user has set MALLOC_... variables, or with a C library other than glibc.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None or any(name.startswith("MALLOC_") for name in os.environ):

@@ -39,7 +39,7 @@ class ModePasses:
         self._weights = _Weights(z, y, x, *map(address, self._arrays))
 
     def apply(self, given: np.ndarray, modes: np.ndarray) -> tuple[np.ndarray, float]:
-        """I = P (scale * given) + penalty * modes, where P projects on solenoidal modes; and <I, modes>."""
+        """Return I = P (scale * given) + penalty * modes and <I, modes>. P projects on solenoidal modes."""
         applied = np.empty_like(modes)
         return applied, self._call("modes_image", ctypes.c_double, [], [given, modes, applied])
 

@@ -32,10 +32,10 @@ class _Listed(ctypes.Structure):
 
 def neighbors_within(library: ctypes.CDLL, box: Box, radius: float, receivers: np.ndarray, senders: np.ndarray,
                      exclude_self: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The senders (s, 3) within a radius of each receiver (n, 3): offsets (n + 1,), and row numbers of senders (m,).
+    """Find the senders (s, 3) within a radius of each receiver (n, 3). Returns `offsets` (n + 1,) and `rows` (m,).
 
-    Receiver i has the row numbers from place offsets[i] to offsets[i + 1] - 1. With `exclude_self` receiver i is sender
-    i, and is not its own neighbour. All positions must be finite.
+    The neighbours of receiver i are the senders in the rows `rows[offsets[i]:offsets[i + 1]]`. With `exclude_self`,
+    receiver i and sender i are one particle, which is not its own neighbour. All positions must be finite.
     """
     receivers, senders = (np.ascontiguousarray(points, np.float64) for points in (receivers, senders))
     offsets = np.empty(len(receivers) + 1, np.int64)
@@ -50,10 +50,11 @@ def neighbors_within(library: ctypes.CDLL, box: Box, radius: float, receivers: n
 
 def pairs_within(library: ctypes.CDLL, box: Box, radius: float, receivers: np.ndarray, senders: np.ndarray,
                  offsets: np.ndarray, listed: np.ndarray, rows: np.ndarray, kind: np.dtype) -> tuple[np.ndarray, ...]:
-    """The pairs of a list (`offsets`, `listed`) that are within a radius now, for the receivers `rows` (k,).
+    """Find the pairs of a neighbour list whose present distance is within a radius, for the receivers `rows` (k,).
 
-    Returns for each pair the receiver, its place in `rows` and the sender (m,), the displacement to the nearest image
-    (3, m), and the distance (m,).
+    `offsets` and `listed` are the list, as `neighbors_within` returns it. Returns five columns of the m pairs: row of
+    the receiver (m,), its place in `rows` (m,), row of the sender (m,), displacement x_receiver - x_sender between
+    nearest images (3, m), and distance (m,).
     """
     receivers, senders = (np.ascontiguousarray(points, np.float64) for points in (receivers, senders))
     rows, first = np.ascontiguousarray(rows, np.int64), np.empty(len(rows) + 1, np.int64)

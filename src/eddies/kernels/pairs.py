@@ -11,7 +11,7 @@ import numpy as np
 from eddies.kernels.library import ADDRESS, INT, NUMBER, address, members
 
 MOST_SCALARS = 4
-# Results of calls. Any other result is the number of the first particle whose position is not finite.
+# Results of a library function. Any other result is the number of the first particle whose position is not finite.
 DONE, UNKNOWN, NO_GRADIENT = -1, -2, -3
 
 
@@ -19,8 +19,8 @@ DONE, UNKNOWN, NO_GRADIENT = -1, -2, -3
 class Summand:
     """A quantity to sum over pairs: its name `kind` and its constants `numbers`, as in summands.hpp.
 
-    The second particle of a mutual pair gets the first one's value times `parity` (components,). `scalar` is the
-    number of the first scalar column that the summand reads.
+    If each pair is evaluated once (`PairSpace.mutual`), its second particle gets the first one's value times `parity`
+    (components,). `scalar` is the number of the first scalar column that the summand reads.
     """
 
     kind: str
@@ -42,7 +42,7 @@ def kinds(library: ctypes.CDLL) -> list[str]:
 class PairSpace:
     """The box of the pairs, the distance `radius` within which two particles are a pair, and the units of the summands.
 
-    With `mutual` each pair is evaluated once, for both particles.
+    If `mutual` is true, each pair is evaluated once, for both particles.
     """
 
     length: float
@@ -65,10 +65,10 @@ class _Given(ctypes.Structure):
 
 
 class CompiledPairs:
-    """Particles, and sums over pairs for each particle that is `wanted`, bool (n,), in the precision `kind`.
+    """Computes sums over the pairs of n particles, in the precision `kind`, for the particles `wanted`, bool (n,).
 
-    `position` and `velocity` have the shape (n, 3). `scalars` (k, n) are at most MOST_SCALARS columns, in the units of
-    the summands. Raises ValueError for other shapes.
+    `position` and `velocity` have the shape (n, 3). `scalars` (k, n) are at most MOST_SCALARS further columns of the
+    particles, in the units of the summands. Raises ValueError for other shapes.
     """
 
     def __init__(self, library: ctypes.CDLL, space: PairSpace, position: np.ndarray, velocity: np.ndarray,
@@ -96,10 +96,10 @@ class CompiledPairs:
 
     def gradients(self, summands: Sequence[Summand], parameters: Sequence[np.ndarray], by_sums: Sequence[np.ndarray],
                   columns: bool) -> tuple[list[np.ndarray], tuple[np.ndarray, ...]]:
-        """Gradients with respect to parameters and, if `columns`, to position, velocity and scalars.
+        """Gradients of a loss with respect to parameters and, if `columns`, to position, velocity and scalars.
 
-        `by_sums` are gradients with respect to the sums; they are zero at particles that are not wanted. Raises
-        ValueError as `sums` does, and if a summand has no gradient.
+        `by_sums` are the gradients of the loss with respect to the sums. They must be zero at particles that are not
+        wanted. Raises ValueError as `sums` does, and if a summand has no gradient.
         """
         by_parameters = [np.zeros(len(values)) for values in parameters]
         by_columns = tuple(np.empty_like(column) for column in self._columns[:3]) if columns else ()

@@ -48,9 +48,9 @@ def kernel_numbers(support: float, pieces: np.ndarray, signed: bool = False) -> 
 
 def sums_on_grid(library: ctypes.CDLL, grid: GridPlanes, numbers: tuple[float, ...], position: np.ndarray,
                  columns: np.ndarray) -> np.ndarray:
-    """sum_j c_j W(x - x_j) of columns c (n, 4) of particles (n, 3) at the points of the planes, (points, 4).
+    """Sums over particles x_j (n, 3) of c_j W(x - x_j), for columns c (n, 4), at points x of the planes: (points, 4).
 
-    The result has the precision of the columns.
+    `numbers` are W as `kernel_numbers` returns it. The result has the precision of the columns.
     """
     position, columns = np.ascontiguousarray(position, np.float64), np.ascontiguousarray(columns)
     if columns.shape != (len(position), 4):
@@ -65,11 +65,12 @@ def sums_on_grid(library: ctypes.CDLL, grid: GridPlanes, numbers: tuple[float, .
 def fitted(library: ctypes.CDLL, box: Box, degree: int, numbers: tuple[float, ...], volume: float, ridge: float,
            offsets: np.ndarray, senders: np.ndarray, receivers: np.ndarray, positions: np.ndarray,
            values: np.ndarray) -> np.ndarray:
-    """Moving least squares: value and derivatives along x, y and z of three fitted components, (n, 4, 3).
+    """Moving least squares of three components, (n, 4, 3): their values, then their derivatives along x, y and z.
 
-    `eddies.particles.particle_field.ParticleField.fitted` defines them. `numbers` are the weight W as `kernel_numbers`
-    returns it, `volume` the mean volume of a particle. `offsets` (n + 1,) and `senders` (m,) list the particles near
-    each receiver; some may lie outside the support. `positions` and `values` are (s, 3), `receivers` (n, 3).
+    `eddies.particles.particle_field.ParticleField.fitted` defines the fit. `numbers` are the weight W as
+    `kernel_numbers` returns it, `volume` is the mean volume of a particle. `offsets` (n + 1,) and `senders` (m,) list
+    the particles near each receiver; some may lie outside the support. `positions` and `values` are (s, 3), `receivers`
+    (n, 3).
     """
     kernel = np.array(numbers)
     offsets, senders = (np.ascontiguousarray(rows, np.int64) for rows in (offsets, senders))

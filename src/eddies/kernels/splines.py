@@ -10,15 +10,16 @@ import numpy as np
 
 from eddies.kernels.library import ADDRESS, INT, NUMBER, address, members
 
-# Numbers that the library may read beyond the end of the fractions along an axis; the same as in splines.cpp.
+# Padding of `fraction` along each axis, since the library may read beyond the last point; the same in splines.cpp.
 PADDING = 8
 
 
 @dataclass(frozen=True)
 class PaddedPlanes:
-    """The planes that a rank holds of a periodic grid of `cells`^3 points: `planes` of them, from number `lowest` on.
+    """Consecutive planes that a rank holds of a periodic grid of `cells`^3 points: `planes` of them, from `lowest` on.
 
-    They come in parts (components, planes, y, x) that follow each other: ghosts, own planes, ghosts.
+    The methods of `Splines` take them as `parts`, three arrays (components, planes, y, x): ghosts below, own planes,
+    ghosts above.
     """
 
     cells: int
@@ -40,10 +41,10 @@ class _Cloud(ctypes.Structure):
 
 
 class Splines:
-    """The (degree + 1)^3 tensor-product B-splines around points (n, 3), of degree 3 or 5.
+    """The (degree + 1)^3 tensor-product B-splines around each of n points, for interpolation of degree 3 or 5.
 
-    x and y are periodic; z is periodic too, but the splines must lie within the planes. The points are sorted once,
-    here. Raises MisplacedPoint.
+    `positions` (n, 3) are periodic in x, y and z, but the splines must lie within the planes. The points are sorted
+    once, in the constructor. Raises MisplacedPoint.
     """
 
     def __init__(self, library: ctypes.CDLL, degree: int, positions: np.ndarray, padded: PaddedPlanes) -> None:
@@ -60,19 +61,19 @@ class Splines:
             raise MisplacedPoint(misplaced)
 
     def at(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """Values (n, c) at the points, from planes of coefficients and in the precision of the planes."""
+        """Values (n, c) at the points, float64, from planes of coefficients; summed in the precision of the planes."""
         values = np.empty((self._cloud.points, len(parts[0])))
         self._call("splines_at", _contiguous(parts), values)
         return values
 
     def slope(self, parts: Sequence[np.ndarray], factors: np.ndarray) -> np.ndarray:
-        """Gradient (n, 3), with respect to the positions, of sum_c factors_c f_c, at fixed factors (n, c)."""
+        """Gradient (n, 3) by position of sum_c factors_c f_c, with interpolated fields f_c and fixed factors (n, c)."""
         gradients = np.empty((self._cloud.points, 3))
         self._call("splines_slope", _contiguous(parts), np.ascontiguousarray(factors, np.float64), gradients)
         return gradients / self._padded.spacing
 
     def spread(self, values: np.ndarray, parts: Sequence[np.ndarray]) -> None:
-        """Add to planes the transpose of `at`, applied to values (n, c). Planes are contiguous and of one precision."""
+        """Add values (n, c) to planes by the transpose of `at`. Planes must be contiguous and of one precision."""
         self._call("splines_spread", parts, np.ascontiguousarray(values, np.float64))
 
     def _call(self, name: str, parts: Sequence[np.ndarray], *columns: np.ndarray) -> None:

@@ -39,7 +39,7 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class KernelNeighborhood:
-    """Halo and list within a kernel's support; position (s, 3) and volumes (s,) of the particles and their ghosts."""
+    """Halo and neighbour list within a kernel's support; position (s, 3) and volumes (s,) of particles, then ghosts."""
 
     kernel: SmoothingKernel
     neighborhood: Neighborhood
@@ -49,7 +49,7 @@ class KernelNeighborhood:
 
 @dataclass(frozen=True)
 class FieldLater:
-    """Particles and filtered flow one frame after the frame that is trained on, the training frame.
+    """Particles and filtered flow one frame after the training frame, the frame to which the model is fitted.
 
     Parameters
     ----------
@@ -72,10 +72,10 @@ class TrainingFrame:
 
     Parameters
     ----------
-    dynamics : of the model, on the slabs of the particles; for this frame alone.
-    particles : at the time of the frame.
+    dynamics : evaluates the model on the slabs of the particles. Each frame needs dynamics of its own.
+    particles : the particles at the time of the frame.
     acceleration, density_rate : true rates (n, 3) and (n,); no density rate if no term reads the density.
-    later : the filtered flow for the field loss; without it that loss compares with the true particles.
+    later : the filtered flow that the field loss compares with; if None, this loss compares with the true particles.
 
     `acceleration_rms` and `density_rate_rms` are the rms of one component of the true rates over all ranks. `total` is
     the number of particles of all ranks.
@@ -87,23 +87,24 @@ class TrainingFrame:
         self.particles, self.acceleration, self.density_rate = particles, acceleration, density_rate
         self.later = later
         self.kept = self.model.linear_rates(dynamics.context(particles))
-        dynamics.release()  # kriging weights, which the other terms may not need
+        dynamics.release()  # frees kriging weights, which nonlinear terms may not need
         self.acceleration_rms, self.total = self._rms(acceleration)
         self.density_rate_rms = None if density_rate is None else self._rms(density_rate)[0]
         self._sorted_ids, self._row_of_sorted = torch.sort(particles.id)
         self._within: KernelNeighborhood | None = None
 
     def _rms(self, rate: Tensor) -> tuple[float, int]:
-        """Root mean square of a component over all ranks, and the number of rows."""
+        """Root mean square of one component, and number of rows, both over all ranks."""
         square = float(rate.double().square().sum())
         square, count = global_sum(self.decomposition.comm, np.array([square, len(rate)]))
         return float(np.sqrt(square / (count * rate.shape[1:].numel()))), int(count)
 
     @cached_property
     def fluctuation(self) -> Tensor:
-        """(v - <v>) d / u'^3 (n, 3), d the filter width, u' the rms of a component of v - <v>; collective.
+        """Scaled velocity fluctuation (v - <v>) d / u'^3, (n, 3); collective.
 
-        Its product with an acceleration is the power in units of u'^3 / d.
+        d is the filter width and u' the rms of one component of v - <v>. The scalar product with an acceleration is the
+        power in units of u'^3 / d.
         """
         velocity = self.particles.velocity
         velocity = velocity - mean_over_ranks(self.decomposition.comm, velocity)
@@ -119,12 +120,12 @@ class TrainingFrame:
 
     @property
     def averaged(self) -> ParticleSet:
-        """The particles at the positions at which the field loss averages over them."""
+        """The particles at the positions of the field loss: those of the next frame if `later` is given."""
         return self.particles if self.later is None else replace(self.particles, position=self.later.position)
 
     @torch.no_grad()
     def within(self, kernel: SmoothingKernel) -> KernelNeighborhood:
-        """Halo, list and volumes of the `averaged` particles within a kernel's support; collective.
+        """Halo, neighbour list and volumes of the `averaged` particles within a kernel's support; collective.
 
         The result is kept until another kernel is given.
         """
@@ -140,9 +141,9 @@ class TrainingFrame:
         return self._within
 
     def errors(self, rows: Tensor | None = None, density: Tensor | None = None) -> dict[str, Tensor]:
-        """Predicted minus true "acceleration" (k, 3) and, if the model has one, "density_rate" (k,); collective.
+        """Predicted minus true rates: "acceleration" (k, 3) and, if the model has it, "density_rate" (k,); collective.
 
-        They are for all owned particles, or for `rows` (k,). `density` (n,) replaces the density that terms give.
+        The k particles are `rows` or all owned ones. `density` (n,) replaces the density that terms give.
         """
         chosen = slice(None) if rows is None else rows
         rates = self.dynamics.rates(self.particles, rows, self.kept, density)
@@ -159,18 +160,18 @@ class TrainingFrame:
 
 
 class ForceTrainer:
-    """Trains a particle model, first on trajectories and power, then on all losses of Eq. 15 together.
+    """Trains a particle model, first on the trajectory and power losses, then also on the other losses of Eq. 15.
 
-    Every step draws a frame, and then `batch` particles by their ids or, for the field loss, all particles in and
-    around a cube of the box. Both are drawn from (seed, step) alone, so that the loss is the same on any number of
-    ranks.
+    Every step draws a frame. A step with the field loss also draws a cube of the box, and takes all particles in and
+    around the cube. Any other step draws `batch` particles by their ids. All draws depend on (seed, step) alone, so
+    that the loss is the same on any number of ranks.
 
     Parameters
     ----------
-    model, frames : all frames are on the same slabs.
-    kernel : of the field loss; None without that loss. The grid of the loss has about as many points as there are
-        particles, or is the grid of the filtered field.
-    weights : of the losses.
+    model, frames : the model, and its frames, all on the same slabs.
+    kernel : kernel of the field loss; None without this loss. The points of the loss are those of the filtered field;
+        without one, a grid with about as many points as there are particles.
+    weights : weights of the losses.
     batch : number of particles in a step without the field loss.
     """
 
@@ -185,20 +186,26 @@ class ForceTrainer:
                         else later.points)
 
     def trajectory_step(self, optimizer: Adam, step: int) -> dict[str, float]:
-        """One step on the trajectory loss (Eq. 12) and the power loss of a random batch; returns the losses."""
+        """One optimiser step on the trajectory loss (Eq. 12) and the power loss of a random batch.
+
+        Returns the weighted sum "loss", each unweighted loss, such as "power_loss", and "gradient_norm".
+        """
         frame, random = self._drawn(step)
         rows = frame.rows(random.choice(self.total, self.batch, replace=False))
         return self._step(optimizer, self._one_step_shares(frame, rows, frame.errors(rows), self.batch))
 
     def combined_step(self, optimizer: Adam, step: int) -> dict[str, float]:
-        """One step on all losses, in a random cube if there is a field loss, else on a random batch; returns losses."""
+        """One optimiser step on all losses, in a random cube if there is a field loss, else on a random batch.
+
+        Returns the same numbers as `trajectory_step`, for all losses.
+        """
         return self._step(optimizer, self._combined_shares(*self._drawn(step)))
 
     @torch.no_grad()
     def one_step_error(self, frame: TrainingFrame, most: int) -> float:
         """Normalised L2 error of the acceleration on a fixed sample of at most `most` particles of a frame; collective.
 
-        With a power loss it is the root of the sum of that squared error and the weighted power loss.
+        With a power loss, the result is the root of the squared error plus the weighted power loss.
         """
         count = min(most, self.total)
         rows = frame.rows(np.random.default_rng(self.seed).choice(self.total, count, replace=False))
@@ -211,7 +218,7 @@ class ForceTrainer:
 
     @torch.no_grad()
     def combined_error(self, frame: TrainingFrame, draws: int) -> float:
-        """Root of the weighted sum of all losses on one frame, averaged over fixed random draws; collective."""
+        """Root of the mean, over fixed random draws, of the weighted sum of all losses on one frame; collective."""
         shares = [self._weighted(self._combined_shares(frame, np.random.default_rng([self.seed, draw])))
                   for draw in range(draws)]
         return float(shared_values(self.comm, {"loss": sum(shares)})["loss"] / draws) ** 0.5
@@ -240,7 +247,7 @@ class ForceTrainer:
         return sum(getattr(self.weights, name, 1.0) * share for name, share in shares.items())
 
     def _step(self, optimizer: Adam, shares: dict[str, Tensor]) -> dict[str, float]:
-        """A step down the weighted sum of the losses; returns them."""
+        """Take an optimiser step on the weighted sum of the losses; see `trajectory_step` for the result."""
         total = self._weighted(shares)
         norm = optimizer.step(total)
         named = {f"{name}_loss": share for name, share in shares.items()}
@@ -248,11 +255,11 @@ class ForceTrainer:
 
     def _one_step_shares(self, frame: TrainingFrame, rows: Tensor, errors: dict[str, Tensor],
                          count: int) -> dict[str, Tensor]:
-        """Shares of the losses that need no kernel and no histograms, over `count` particles of all ranks.
+        """This rank's shares of the trajectory loss and the power loss, over `count` particles of all ranks.
 
-        The trajectory loss is Eq. 12 with centred differences. Each rate is in units of its rms at the time: all frames
-        of a decaying flow count alike. The density rate is part of this loss unless one of its terms is learned through
-        several steps of the simulation.
+        The trajectory loss is Eq. 12 with centred differences. Each rate is divided by its rms in the frame, so that
+        all frames of a decaying flow count alike. A learned density rate is part of the trajectory loss, unless a term
+        of this rate is learned through several steps of the simulation.
         """
         share = mean_square_share(errors["acceleration"], frame.acceleration_rms, count)
         if self.model.regresses_density:
@@ -263,26 +270,28 @@ class ForceTrainer:
         return shares
 
     def _power_share(self, frame: TrainingFrame, rows: Tensor, error: Tensor, count: int) -> Tensor:
-        """((d / u'^3) <(v - <v>) . (a - a_true)>)^2, <.> the mean over particles: the squared error of the power.
+        """This rank's share of the squared error of the power, ((d / u'^3) <(v - <v>) . (a - a_true)>)^2.
 
-        Coefficients that are fitted to accelerations alone drain too little energy: the features are noisy, so that
-        the regression is attenuated.
+        <.> is the mean over particles. A model fitted to accelerations alone drains too little energy: its features are
+        noisy, which attenuates the coefficients of the regression.
         """
         power = sum_over_ranks(self.comm, (frame.fluctuation[rows].to(error) * error).sum()[None] / count)
         return power.square().sum() / self.comm.size  # every rank has the whole, so its share is an equal part
 
     def _field_share(self, frame: TrainingFrame, rows: Tensor, error: Tensor, inside: Tensor) -> Tensor:
-        """Eq. 13 per time step: squared error of the kernel average <.> at some grid points of all ranks, divided by
-        the mean square of the acceleration.
+        """This rank's share of Eq. 13 per time step: a mean squared error in units of the mean square acceleration.
 
-        Without a field the error is <a - a_true> at the true positions: both velocities one step ahead are averaged by
-        the kernel. The kernel's own error is far larger than the change in a step, and the force cannot correct it.
+        The mean is over the grid points `inside` of all ranks. <.> is the kernel average.
+
+        Without a filtered field, the error is <a - a_true> at the true positions. The kernel averages the predicted and
+        the true velocity one step ahead, so its own error cancels. That error is far larger than the change of velocity
+        in a step, and the force cannot correct it.
 
         With a filtered field u one frame later, the error is (<v> - u) / span. v = v_before + span a is the model's
         velocity after a midpoint step of length span, from the frame before to the frame after. True accelerations are
-        centred differences, so v is the true velocity at the end of the step plus span (a - a_true). The positions
-        there do not depend on a: they are the true ones. This error is therefore the one without a field, plus the
-        kernel's error for the true particles, divided by span.
+        centred differences, so v is the true velocity v_true at the end of the step plus span (a - a_true). The
+        positions there are the true ones, because they do not depend on a. The error is therefore <a - a_true> plus the
+        kernel's own error, (<v_true> - u) / span.
         """
         within, later, points = frame.within(self.kernel), frame.later, self._points[inside]
         change = torch.zeros_like(frame.acceleration).index_add(0, rows, error)
@@ -299,9 +308,9 @@ class ForceTrainer:
         return mean_square_share(field, frame.acceleration_rms, max(count, 1))
 
     def _divergence_shares(self, frame: TrainingFrame, rows: Tensor, error: Tensor) -> dict[str, Tensor]:
-        """Eq. 14 over all components, for the acceleration and for the velocity.
+        """This rank's shares of Eq. 14 for acceleration and velocity, each with all components in one histogram.
 
-        The velocity is the true one plus the effect of the error of the acceleration after a time v_rms / a_rms.
+        The predicted velocity is the true one plus the error of the acceleration times v_rms / a_rms.
         """
         shares, truth = {}, frame.acceleration[rows]
         if self.weights.acceleration_kl > 0:

@@ -28,10 +28,11 @@ class KernelSample:
 
     Parameters
     ----------
-    particles : with their velocities.
-    field, gradient : velocity (m, 3) and gradient (m, 3, 3) [component, direction] at the m grid points, z slowest.
+    particles : the particles in the slab, with their velocities.
+    field, gradient : filtered velocity (m, 3) and its gradient (m, 3, 3) [component, direction] at the m grid points
+        of the slab, z slowest.
 
-    `mean_square` holds the mean squares of a component of the velocity and of the gradient, over the whole grid.
+    `mean_square` holds the mean squares of one component of the velocity and of the gradient, over the whole grid.
     """
 
     def __init__(self, particles: ParticleField, field: Tensor, gradient: Tensor) -> None:
@@ -40,7 +41,7 @@ class KernelSample:
         self.mean_square = self._mean_squares(self.field, self.gradient)
 
     def own_rows(self, points: np.ndarray) -> Tensor:
-        """Rows of the points that lie in this slab; `points` are numbers in the whole grid, z slowest."""
+        """Rows in `field` of those `points` that this slab holds; `points` are numbers in the whole grid, z slowest."""
         n = self.decomposition.planes
         own = points[(points // n**2 >= self.decomposition.start) & (points // n**2 < self.decomposition.stop)]
         return torch.from_numpy(own - self.decomposition.start * n**2)
@@ -74,7 +75,7 @@ class KernelTrainer:
         rows = sample.own_rows(np.sort(random.choice(self.total, self.points, replace=False)))
         kernel = self.network.table()
         velocity, gradient = sample.particles.on_grid(kernel, sample.particles.volumes_by_table(kernel), rows)
-        # Each term in units of the mean square of the reconstructed quantity.
+        # Errors of velocity and gradient are in units of the rms of the filtered quantity.
         error = velocity - sample.field[rows]
         shares = {"velocity": mean_square_share(error, sample.mean_square[0] ** 0.5, self.points)}
         total = shares["velocity"]

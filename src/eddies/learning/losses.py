@@ -12,9 +12,9 @@ from eddies.particles.exchanges import sum_over_ranks
 
 
 def mean_square_share(error: Tensor, scale: float, total: int) -> Tensor:
-    """This rank's share of the mean of |error|^2 / scale^2 over `total` rows of all ranks and all components.
+    """This rank's share of the mean of (error / scale)^2 over all components of the `total` rows of all ranks.
 
-    Shares add up to the mean (Eq. 12 with each component scaled to one).
+    The shares of all ranks add up to this mean, Eq. 12 with each component in units of `scale`.
     """
     components = error.shape[1] if error.dim() > 1 else 1
     return (error / scale).square().sum() / (components * total)
@@ -28,10 +28,10 @@ def relative_error(comm: Comm, error: Tensor, exact: Tensor) -> float:
 
 
 def soft_histogram(comm: Comm, values: Tensor, bins: int, reach: float) -> Tensor:
-    """Differentiable global histogram (bins,) of values of any shape over [-reach, reach], of mass 1; collective.
+    """Histogram (bins,) over [-reach, reach] of the values of all ranks, with sum 1; collective, differentiable.
 
-    Each value spreads its mass linearly over the two nearest bin centres. Values beyond the ends count at the ends. The
-    histogram is NaN if a value is NaN.
+    `values` may have any shape. Each value is shared linearly between the two nearest bin centres. Values beyond an end
+    count in the bin there. The histogram is NaN if a value is NaN.
     """
     position = (values.flatten().clamp(-reach, reach) + reach) * ((bins - 1) / (2 * reach))
     lower = position.detach().nan_to_num().floor().clamp(max=bins - 2).long()
@@ -43,6 +43,9 @@ def soft_histogram(comm: Comm, values: Tensor, bins: int, reach: float) -> Tenso
 
 
 def kullback_leibler(truth: Tensor, predicted: Tensor, floor: float = 1e-6) -> Tensor:
-    """sum_k P log(P / Q) of two histograms (bins,) (Eq. 14), after `floor` is added to every bin of both."""
+    """Divergence sum_k P log(P / Q) of two histograms (bins,), Eq. 14, with P the truth and Q the prediction.
+
+    `floor` is first added to every bin. The sum of each histogram is then scaled to 1.
+    """
     truth, predicted = (truth + floor) / (truth + floor).sum(), (predicted + floor) / (predicted + floor).sum()
     return (truth * torch.log(truth / predicted)).sum()

@@ -20,7 +20,7 @@ from eddies.particles.integrators import Integrator
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
 
-# Smallest mean energy loss of a band, as a share of the largest one: smaller losses are raised to it.
+# Smallest mean energy decay of a band, as a share of the largest one. Smaller decays are raised to it.
 SLOWEST = 0.1
 
 
@@ -30,7 +30,7 @@ class TrainingWindow:
 
     Parameters
     ----------
-    particles : at the start.
+    particles : the particles at the start.
     velocity, density : true values (frames, n, 3) and (frames, n) at the end of frame intervals 1, 2, ...; rows as in
         `particles`; the density may be None.
     energies : (frames + 1, bands), true kinetic energy by bands of wavenumbers, from the start on; or None.
@@ -47,24 +47,25 @@ class RolloutTrainer:
 
     Every step draws a window from (seed, step) and advances all its particles by the integrator of the simulation. The
     loss of frame k is <|v - v_true|^2> / <|v_true - v_start|^2>. It is 1 for particles without acceleration, so all
-    frames count alike. A density whose rate is learned has the same loss.
+    frames count alike. A density whose rate is learned has a loss of the same form.
 
-    The energy loss is the mean over bands of wavenumbers of the squared error of the band's kinetic energy, in units of
-    the mean energy that it loses in that time. Fitted forces are attenuated where their features are noisy: they take
-    too much energy from some scales and too little from others, which the error of the velocity hardly shows.
+    The energy loss is the squared error of the kinetic energy of a band of wavenumbers, averaged over the bands. Its
+    unit is the energy that the band loses on average from the start to the frame. Fitted forces are attenuated where
+    their features are noisy: they take too much energy from some scales and too little from others. The error of the
+    velocity hardly shows this.
 
-    The gradient goes through all steps: force, neighbours, halo, and the grid of the resolved velocity. Each step is
-    computed again in the backward pass, so that memory holds one step.
+    The gradient goes through all steps: force, neighbours, halo, and the grid of the resolved velocity. The backward
+    pass computes each step again, so that memory holds the intermediate results of only one step.
 
     Parameters
     ----------
-    integrator : of dynamics with fixed ranks.
-    windows : on the slabs of the dynamics.
+    integrator : advances particles by dynamics with `fixed_ranks`.
+    windows : true trajectories, on the slabs of the dynamics.
     frame_interval, steps_per_frame : time between frames, and number of time steps in it.
-    energy_weight : of the energy loss; if it is zero, windows need no energies.
-    resolution : gives the energies of particles; unused if the weight is zero.
-    stationary : whether the flow is forced, so that its bands lose no energy on average; the rms change of a band's
-        energy then takes the place of its mean loss.
+    energy_weight : weight of the energy loss; if it is zero, windows need no energies.
+    resolution : computes the band energies of particles; unused if the weight is zero.
+    stationary : whether the flow is forced, so that its bands lose no energy on average. The unit of the energy loss is
+        then the rms change of a band's energy.
     """
 
     def __init__(self, comm: Comm, integrator: Integrator, windows: Sequence[TrainingWindow], frame_interval: float,
@@ -77,7 +78,10 @@ class RolloutTrainer:
         self.losses = mean_losses(windows, stationary) if energy_weight > 0 else None
 
     def step(self, optimizer: Adam, step: int, horizon: int) -> dict[str, float]:
-        """One optimiser step on windows of `horizon` frames; returns the losses."""
+        """One optimiser step on the first `horizon` frames of a random window.
+
+        Returns the sum "loss", the losses of `loss_shares` by name, and "gradient_norm".
+        """
         random = np.random.default_rng([self.seed, step])
         window = self.windows[random.integers(len(self.windows))]
         shares = self.loss_shares(window, horizon)
@@ -87,7 +91,7 @@ class RolloutTrainer:
         return {"loss": sum(values.values()), **values, "gradient_norm": norm}
 
     def loss_shares(self, window: TrainingWindow, horizon: int) -> dict[str, Tensor]:
-        """This rank's shares of the losses of a window, weighted, by name; collective."""
+        """This rank's weighted shares of "rollout_loss" and, if used, "energy_loss" for a window; collective."""
         shares: dict[str, list[Tensor]] = {"rollout_loss": []}
         for reached, particles in self._frames(window.particles, horizon):
             shares["rollout_loss"] += [mean_square_share(error, self._scale(true, start), self.total)
@@ -105,8 +109,8 @@ class RolloutTrainer:
 
     def _energy_share(self, window: TrainingWindow, frame: int, particles: ParticleSet) -> Tensor:
         """This rank's share, an equal part, of the mean squared error of the energies of the bands."""
-        # The solve starts from zero, as for the truth: a prediction would change the energies. In the backward
-        # pass it starts from its own solution and takes no iteration.
+        # The solve for the resolved velocity starts from zero, as for the truth: a prediction would change the
+        # energies. In the backward pass the solve starts from its own solution and takes no iteration.
         near: Tensor | None = None
 
         def energies_of(position: Tensor, velocity: Tensor) -> Tensor:
@@ -136,7 +140,7 @@ class RolloutTrainer:
         del given["id"]
 
         def advance(*columns: Tensor) -> tuple[Tensor, ...]:
-            # New lists and the same predictions, so that the backward pass repeats the step exactly.
+            # A new neighbour list and restored predictions: the backward pass then repeats the step exactly.
             self.integrator.dynamics.forget()
             self.integrator.dynamics.load_state_dict(state)
             start = ParticleSet(particles.id, **dict(zip(given, columns)))
@@ -152,7 +156,7 @@ class RolloutTrainer:
 
     def _errors(self, window: TrainingWindow, frame: int,
                 particles: ParticleSet) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Error, true value and start value: of the velocity, and of a density whose rate is learned."""
+        """Yield error, true value and start value of the velocity and, if its rate is learned, of the density."""
         yield particles.velocity - window.velocity[frame], window.velocity[frame], window.particles.velocity
         if self.integrator.dynamics.model.learns_density:
             yield particles.density - window.density[frame], window.density[frame], window.particles.density
@@ -168,7 +172,10 @@ UNWRAPPED = getattr(checkpoint, "__wrapped__", checkpoint)
 
 
 def mean_losses(windows: Sequence[TrainingWindow], stationary: bool = False) -> Tensor:
-    """Size of the change of ln(energy) of each band per frame, (bands,): mean over windows, or rms if `stationary`."""
+    """Change of ln(energy) of each band per frame, as a magnitude (bands,), at least SLOWEST times the largest.
+
+    It is the absolute value of the mean over windows, or the rms over windows if `stationary`.
+    """
     changes = torch.stack([window.energies[-1] / window.energies[0] for window in windows]).log()
     change = changes.square().mean(0).sqrt() if stationary else changes.mean(0)
     losses = (change / (len(windows[0].energies) - 1)).abs()

@@ -22,11 +22,11 @@ class Phase:
 
     Parameters
     ----------
-    name : for the progress line.
-    work : cost of each optimiser step, in a unit common to all phases, to estimate the time left.
+    name : name in the progress line.
+    work : (steps,), cost of each optimiser step in a unit common to all phases, to estimate the time left.
     rates : learning rate of the first and of the last step.
     take : takes one step of the optimiser, given its number within the phase; returns losses by name.
-    validate : error on held-out data; the phase ends with the state of least error, or if None with the last.
+    validate : returns the error on held-out data. The phase ends with the state of least error; if None, with the last.
     validate_every : steps between two validations; the last step is validated too.
     patience : the phase ends after this many steps without a smaller validation error; if None, after all steps.
     """
@@ -52,9 +52,11 @@ class TrainingDiverged(ValueError):
 class Training:
     """Trains a model in phases, in order, each of at least one step.
 
-    A validated phase ends with its state of least error, which may be its first. All ranks hold the same state.
+    A validated phase ends with its state of least error, which may be the state before its first step. All ranks hold
+    the same state.
 
-    `history` has a row for each step. The first row of a phase has `start_error`, the validation error before it.
+    `history` has a row of numbers by name for each step. The first row of a validated phase has `start_error`, the
+    validation error before the step.
     """
 
     def __init__(self, comm: Comm, model: nn.Module, phases: Sequence[Phase]) -> None:
@@ -162,7 +164,7 @@ class Training:
         self._seconds_before = self.history[-1]["seconds"] if self.history else 0.0
 
     def _error_of(self, validate: Callable[[], float]) -> float:
-        """The validation error, infinite if it is not finite or particles leave their slabs; keeps the best state."""
+        """The validation error; infinite if it is not finite or a HaloError occurs. Stores the best state so far."""
         try:
             error = validate()
         except HaloError:

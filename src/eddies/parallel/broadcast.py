@@ -1,4 +1,4 @@
-"""Text that one rank sends to all, and work on some ranks whose errors all ranks raise."""
+"""Text that one rank sends to all ranks, and actions whose errors are raised on all ranks."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -57,7 +57,7 @@ def on_first_rank(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
 def on_all_ranks(comm: MPI.Comm, action: Callable[[], Result], kind: type[Exception] = OSError) -> Result:
     """Run an action on all ranks and return its result on this one.
 
-    If the action raises an error of class `kind` on some ranks, all ranks raise it with the text of the lowest one.
+    If some ranks raise an error of class `kind`, all ranks raise it, with the text of the lowest of these ranks.
     """
     result: Any = None
     complaint = None

@@ -27,7 +27,10 @@ def node_ranks(comm: Comm) -> int:
 
 
 def warn_of_few_processors(comm: Comm) -> None:
-    """Log a warning on rank 0 if the threads of its node's ranks exceed the processors of the node; collective."""
+    """Log a warning on rank 0 if it has several threads and fewer processors than threads; collective.
+
+    Its processors are those that it may use, but at most an equal share of the processors of all ranks on its node.
+    """
     with _node(comm) as node:
         together = within_quota(set().union(*node.allgather(processors())))
         own, number = max(min(within_quota(processors()), together // node.size), 1), threads()

@@ -1,4 +1,4 @@
-"""Checks whether MPI connects the ranks that a launcher has started, and whether all of them arrive at one place."""
+"""Checks whether MPI connects the ranks that a launcher has started, and whether all ranks reach the same call."""
 
 import os
 import time
@@ -7,11 +7,11 @@ from mpi4py import MPI
 
 from eddies.errors import UserError
 
-# Variables in which launchers write the number of ranks, and each rank's number. The first that is set counts: mpirun
-# within a Slurm step inherits the variables of that step.
+# Environment variables of launchers: number of ranks, and number of this rank. Only the first one that is set counts,
+# because mpirun within a Slurm step inherits the variables of that step.
 LAUNCHERS = {"OMPI_COMM_WORLD_SIZE": "OMPI_COMM_WORLD_RANK", "PMI_SIZE": "PMI_RANK",
              "SLURM_STEP_NUM_TASKS": "SLURM_PROCID"}
-# The shell of `srun --pty` is one of the tasks; a program started in it by hand inherits the variables of Slurm.
+# Set in the shell of `srun --pty`. A program started there by hand inherits the variables of Slurm, which do not count.
 SHELL = "SLURM_PTY_PORT"
 PATIENCE = 5.0  # seconds that a rank waits for the others to reach the same error
 

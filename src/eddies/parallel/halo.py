@@ -14,7 +14,7 @@ class HaloError(UserError, ValueError):
 
 
 class HaloExchange:
-    """Ghost particles: the neighbours' particles within `width` of this slab. Planned once, used for any column.
+    """Exchange of ghosts, the neighbouring ranks' particles within `width` of this slab; planned once for any column.
 
     Parameters
     ----------
@@ -22,10 +22,10 @@ class HaloExchange:
     positions : (n, 3), owned particles with z within this rank's slab.
     width : a rank needs the particles up to this distance beyond the faces of its slab.
 
-    Each rank sends the particles near its lower face down and those near its upper face up. The two faces stay
+    Each rank sends the particles near its lower face down and those near its upper face up. The two exchanges stay
     separate even if both neighbours are the same rank: a particle then may have two images, which differ in z by a
-    period. Ghost rows from above come first, then those from below. With a single rank there are no
-    ghosts, and the methods must not be called. Raises HaloError if a slab is thinner than `width`.
+    period. Of the `count` ghost rows, those from above come first, then those from below. With a single rank there are
+    no ghosts, and the methods must not be called. Raises HaloError if a slab is thinner than `width`.
     """
 
     def __init__(self, decomposition: SlabDecomposition, positions: np.ndarray, width: float) -> None:

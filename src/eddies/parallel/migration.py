@@ -79,7 +79,7 @@ def migrate(decomposition: SlabDecomposition, columns: dict[str, np.ndarray]) ->
 
 
 def id_block(comm: MPI.Comm, total: int) -> tuple[int, int]:
-    """Return the first id and the (exclusive) end of the block of `total` ids that this rank stores."""
+    """Return the first id and the (exclusive) end of the block of ids that this rank stores, out of `total` ids."""
     starts = block_starts(total, comm.size)
     return int(starts[comm.rank]), int(starts[comm.rank + 1])
 

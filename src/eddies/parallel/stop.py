@@ -1,4 +1,4 @@
-"""Orderly stop: signals, a file STOP and a limit of wall time, which all ranks see at the same step."""
+"""Orderly stop of all ranks at the same step, by a signal, a file STOP or a limit of wall time."""
 
 import contextlib
 import math
@@ -22,12 +22,12 @@ LOOK_SECONDS = 1.0  # between two checks for the file: on a network file system 
 _NOTHING, _CHECKPOINT, _TIME, _FILE, _SIGNALS = range(5)
 _LOST = 1000
 
-# Returns the error to raise, or None.
+# Returns the error to raise if the job has lost the lock of its run directory, else None.
 LockLoss = Callable[[], UserError | None]
 
 
 class Stopped(Exception):
-    """The job stops on request, all ranks at the same place. `then` says what the next job does."""
+    """The job stops on request, all ranks at the same place. `then` says what the same command does next time."""
 
     def __init__(self, reason: str, then: str = "continues after the last finished stage") -> None:
         super().__init__(f"stopped by {reason}; the same command {then}")
@@ -41,7 +41,7 @@ class StopRequest:
     comm : communicator of the job.
     signals : numbers of the signals that this rank has received; a handler appends to this list.
     stop_file : file that rank 0 looks for at most once a second, and removes when the job stops.
-    max_seconds : wall time from now on after which the job stops.
+    max_seconds : wall time after which the job stops, counted from the construction.
     checkpoint_seconds : wall time between two checkpoints.
     """
 
@@ -56,7 +56,7 @@ class StopRequest:
 
     @contextlib.contextmanager
     def watching(self, lock_lost: LockLoss) -> Iterator[None]:
-        """Within this context, a call raises, on all ranks, the error that `lock_lost` returns on rank 0."""
+        """Within this context, calls of this object raise on all ranks the error that `lock_lost` returns on rank 0."""
         self._lock_losses.append(lock_lost)
         try:
             yield

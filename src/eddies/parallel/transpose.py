@@ -1,4 +1,4 @@
-"""Global transpose of the slab transform: planes cut along z become columns cut along y."""
+"""Global transpose for Fourier transforms on slabs: planes cut along z become columns cut along y."""
 
 import numpy as np
 from mpi4py import MPI
@@ -7,11 +7,12 @@ from eddies.parallel.slab import block_starts
 
 
 class Transpose:
-    """Memory in which ranks exchange a batch of components (components, z, y, x), in one message each way.
+    """Buffers in which ranks exchange an array (components, z, y, x), in one message each way.
 
-    As planes a rank has a block of z and all of y; as columns it has all of z and a block of y, by the rule of
-    `block_starts`. `column_blocks[r]` (components, planes of r, own columns, x) and `plane_blocks[r]` (components, own
-    planes, columns of r, x) are filled and read in place. A rank's own block is the same memory in both lists.
+    A rank holds either planes (a block of z, all of y) or columns (all of z, a block of y). `block_starts` defines the
+    blocks. For each rank r there are `column_blocks[r]` (components, planes of r, own columns, x) and
+    `plane_blocks[r]` (components, own planes, columns of r, x), which callers fill and read in place. A rank's own
+    block is the same memory in both lists.
 
     Parameters
     ----------
@@ -52,7 +53,7 @@ class Transpose:
 
 
 def _blocks(shapes: list[tuple[int, ...]], rank: int, own: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return the memory that is sent or received, and its blocks of the given shapes; the block of `rank` is `own`."""
+    """Return a flat buffer for messages, and its blocks of the given shapes. The block of `rank` is `own` instead."""
     sizes = [0 if index == rank else int(np.prod(shape)) for index, shape in enumerate(shapes)]
     flat = np.empty(sum(sizes), own.dtype)
     parts = np.split(flat, np.cumsum(sizes)[:-1])

@@ -28,8 +28,8 @@ from eddies.scene.terms import TermError
 
 # Numbers in memory at once in sums over pairs without a gradient. They fit a core's cache, or a part of a GPU's memory.
 PAIR_VALUES_TOGETHER = {"cpu": 1 << 19, "cuda": 1 << 26}
-# Added to moment matrices and sums of weights, as a fraction of their values for evenly spread neighbours. Their
-# inverse then exists even if there are no neighbours or only coplanar ones; elsewhere the bias is 0.1 %.
+# This fraction of the values for evenly spread neighbours is added to moment matrices and sums of weights. They can
+# then be inverted even without neighbours or with only coplanar ones. In all other cases the bias is 0.1 %.
 REGULARISATION = 1e-3
 UNDECLARED = 'no term of this model reads "{}": add it to the `reads` of the settings'
 
@@ -40,7 +40,7 @@ class PairSum:
     Attributes
     ----------
     width : largest number of values that a pair needs at once; it determines how many pairs are evaluated together.
-    mutual : whether the values of (j, i) are `parity` times those of (i, j). Each pair is then evaluated once.
+    mutual : whether the values of pair (j, i) are `parity` times those of (i, j). Each pair is then evaluated once.
     parity : (components,), 1 or -1 for each component.
     needs_moments : whether a term uses `context.moments` with its sums.
     """
@@ -81,7 +81,8 @@ class Context:
     rows : (k,), the particles for which acceleration and density rate are computed; None: all.
     dtype : type of the pair arithmetic; None: the type of the positions.
     density : (n,), density of the particles; None if terms give it, or if no term reads it.
-    time : time of the evaluation in a run, for which the modes are predicted from earlier ones; None: no prediction.
+    time : time of the evaluation in a run. The solve for the resolved velocity starts from a prediction for this time;
+        None: no prediction.
     """
 
     def __init__(self, decomposition: SlabDecomposition, particles: ParticleSet, flow: FlowUnits,
@@ -166,7 +167,7 @@ class Context:
 
     @cached_property
     def moments(self) -> Moments:
-        """Moments of the neighbourhoods, regularised so that they can be inverted without neighbours."""
+        """Moments of the neighbourhoods, regularised so that they can be inverted even without any neighbour."""
         sums, flow = self.pair_sums(_MOMENTS), self.flow
         expected = moments.expected_moment(flow.neighbors, flow.cutoff / flow.scales.filter_width)
         diagonal = sums.new_tensor([1, 0, 0, 1, 0, 1]).unsqueeze(1)

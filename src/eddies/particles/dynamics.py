@@ -26,12 +26,12 @@ class ParticleDynamics:
     decomposition : slabs, with the communicator.
     model : the terms. If no term reads pairs or the resolved velocity, there is no neighbour list and no halo, and
         particles do not change rank.
-    skin : extra radius of list and halo. They are rebuilt when some particle has moved by half of it.
+    skin : extra radius of neighbour list and halo. Both are rebuilt when some particle has moved by half the skin.
     dtype : precision of pair arithmetic and of the resolved velocity; by default that of the positions. Positions stay
         in double precision; only their differences are converted.
-    fixed_ranks : particles never change rank or row, as gradients through a few steps require. The halo widens by the
-        largest distance of a particle from its slab.
-    drift : largest such distance that is allowed, if a term reads the resolved velocity.
+    fixed_ranks : whether particles keep their rank and row, as gradients through a few steps require. The halo then
+        widens by the largest distance of a particle from its slab.
+    drift : if a term reads the resolved velocity, this distance may be at most skin/2 + `drift`.
 
     `time` is the time at the beginning of the present step; integrators advance it.
     """
@@ -62,11 +62,11 @@ class ParticleDynamics:
         self._local = None
 
     def built_at(self, particles: ParticleSet) -> Tensor | None:
-        """Positions (n, 3) of these particles at the last build of halo and list; None if it was not for them."""
+        """Positions (n, 3) of these particles at the last build of halo and list; None after a build for others."""
         return None if self.neighborhood is None else self.neighborhood.built_at(particles)
 
     def rebuild(self, particles: ParticleSet, built_at: Tensor) -> None:
-        """Build halo and list for these particles at earlier positions (n, 3); collective."""
+        """Build halo and list from `built_at` (n, 3), the positions of these particles at a past build; collective."""
         if self.neighborhood is not None:
             self.forget()
             self.neighborhood.update(replace(particles, position=built_at))
@@ -93,7 +93,8 @@ class ParticleDynamics:
         """Move particles to the ranks of their slabs if halo and list are outdated; collective.
 
         Integrators call it before they evaluate the rates. `companions` are further columns (n, ...) that move with the
-        particles. Nothing changes rank while a gradient is recorded, since that would cut the gradient.
+        particles. Returns the particles and the companions. Nothing changes rank while a gradient is recorded, since a
+        change of rank would cut the gradient.
         """
         companions = companions or {}
         if self.fixed_ranks:
@@ -119,8 +120,9 @@ class ParticleDynamics:
               density: Tensor | None = None, time: float | None = None) -> Rates:
         """Rates of change of the owned particles, or of `rows` (k,) of them; see LagrangianModel.rates.
 
-        `kept` holds stored rates, which replace terms. `density` (n,) replaces the density that terms would give. With
-        a `time` the solve for the resolved velocity starts from a prediction from earlier evaluations.
+        `kept` holds stored rates by name of the term; they replace these terms. `density` (n,) replaces the density
+        that terms would give. If `time` is given, the solve for the resolved velocity starts from a prediction for this
+        time, made from earlier evaluations.
         """
         return self.model.rates(self.context(particles, rows, density, time), kept)
 

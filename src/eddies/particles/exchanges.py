@@ -12,7 +12,7 @@ from eddies.particles.particle_set import as_numpy
 
 
 class _GhostExchange(torch.autograd.Function):
-    """Send rows of owned particles to the ranks that see them. The backward pass sends gradients of copies to owners.
+    """Send rows of owned particles to ranks that have them as ghosts. The backward pass adds ghost gradients to owners.
 
     Both directions are collective. If all ranks compute the same expression, with any number of particles, they also
     take part in the backward exchanges in the same order.

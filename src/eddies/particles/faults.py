@@ -14,7 +14,7 @@ from eddies.particles.periodic_box import PeriodicBox
 
 @dataclass(frozen=True)
 class Limits:
-    """Largest allowed `speed`, and `density_deviation` from `density_mean` for particles with a density."""
+    """Largest allowed speed and, for particles with a density, largest deviation of the density from `density_mean`."""
 
     speed: float
     density_mean: float = 0.0
@@ -24,7 +24,7 @@ class Limits:
 def find_fault(particles: ParticleSet, limits: Limits, box: PeriodicBox, step: int, rank: int) -> str | None:
     """Describe the first particle of this rank whose state is not finite or exceeds the limits; None if all are sound.
 
-    The description has step, rank, particle id, position, velocity, density and the nearest other particle of the rank.
+    The description contains step, rank, particle id, position, velocity, density and the nearest particle of the rank.
     """
     # Comparisons with NaN are false, so the test selects sound particles.
     sound = torch.linalg.vector_norm(particles.velocity, dim=1) <= limits.speed

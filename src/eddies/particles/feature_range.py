@@ -44,7 +44,7 @@ class FeatureRange:
         return cls(global_min(comm, np.min(low, axis=0)), global_max(comm, np.max(high, axis=0)))
 
     def share_outside(self, comm: Comm, blocks: Iterable[Tensor]) -> float:
-        """Share of the pairs in blocks (features, m) of all ranks with a feature outside the range or NaN; collective.
+        """Share of pairs with a NaN or a feature outside the range, in blocks (features, m) of all ranks; collective.
 
         It is zero without pairs.
         """

@@ -1,4 +1,4 @@
-"""Units of a flow: measured scales that make a model dimensionless, and the neighbourhoods of particles."""
+"""Units of a flow: measured scales that make a model dimensionless, and the size of particles' neighbourhoods."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from eddies.errors import UserError
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_sum
 
-# Limits of the highest wavenumber that particles resolve: in units of their Nyquist wavenumber; in units of 1/eta,
-# where the spectrum ends; and by the smallest transfer function of the filter, which is inverted (docs/closure.md).
+# Upper limits of the highest wavenumber that particles resolve: in units of their Nyquist wavenumber; in units of
+# 1/eta, where the spectrum ends; and the wavenumber at which the filter's transfer function has its smallest allowed
+# value, since the closure divides by this function (docs/closure.md).
 BEYOND_NYQUIST, BEYOND_DISSIPATION, LEAST_TRANSFER = 1.5, 1.05, 0.02
 MAY_VANISH = ("viscosity", "kolmogorov_length")
 MEAN_DENSITY = 1.0
@@ -98,14 +99,14 @@ def allowed_step(angle: float, highest: float, speed: float) -> float:
 
 @dataclass(frozen=True)
 class FlowUnits:
-    """Scales of a flow, which make terms dimensionless, and the neighbourhoods of its particles.
+    """Scales of a flow, which make terms dimensionless, and the size of its particles' neighbourhoods.
 
     Parameters
     ----------
     scales : measured at the start of the flow.
     cutoff : h, the radius of interaction of pairs.
-    neighbors : n, the expected number of particles within it.
-    seed : of initial parameters.
+    neighbors : n, the expected number of particles within this radius.
+    seed : seed of the initial parameters.
     """
 
     scales: ReferenceScales
@@ -122,9 +123,9 @@ class FlowUnits:
 def measured_scales(comm: Comm, at: Columns, after: Columns, interval: float) -> dict[str, float]:
     """Rms of velocity, density and their rates over all particles; of vectors, the rms of one component. Collective.
 
-    velocity_rms and density_rms (of the fluctuation) at the frame `at`; acceleration_rms and density_rate_rms from the
-    change to the frame `after`, an `interval` later. Frames are this rank's rows of `velocity` (n, 3) and, optionally,
-    `density` (n,), of the same particles.
+    Returns "velocity_rms" and "density_rms" (of the fluctuation) in the frame `at`. "acceleration_rms" and
+    "density_rate_rms" are those of the change to the frame `after`, divided by `interval`, the time between the frames.
+    Both frames are this rank's rows of `velocity` (n, 3) and, optionally, `density` (n,), of the same particles.
     """
     scales = {}
     for name, rate in RATES.items():

@@ -1,4 +1,4 @@
-"""Forms of reconstruction: velocities and their gradients from particles, behind one interface."""
+"""Methods of reconstruction ("forms"): velocities and their gradients from particles, behind one interface."""
 
 from __future__ import annotations
 

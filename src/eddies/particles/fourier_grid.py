@@ -22,12 +22,12 @@ from eddies.spectral.spectral_grid import SYMMETRIC, SpectralGrid
 
 
 class FourierGrid(ModeOperators):
-    """A periodic grid with one cell for each plane of the slabs, and the modes |k_i| <= `resolved`.
+    """A periodic grid with as many cells along each axis as the slabs have planes, and the modes |k_i| <= `resolved`.
 
     Fields are real tensors (c, z_local, y, x), modes complex ones (c, kz, ky, kx) as in `SpectralGrid`, on the host and
     in the precision of `dtype`. Values at positions are in double precision. Positions (n, 3) lie in this rank's
-    slab or at most `reach` outside it, which is `margin` grid planes. Methods that convert between particles, fields
-    and modes are collective, also in the backward pass.
+    slab or at most `reach` outside it; `reach` is the thickness of `margin` grid planes. Methods that convert between
+    particles, fields and modes are collective, also in the backward pass.
     """
 
     def __init__(self, decomposition: SlabDecomposition, resolved: int, margin: int = 1,
@@ -40,7 +40,7 @@ class FourierGrid(ModeOperators):
                          torch.from_numpy(self.spectral.wavenumber_squared), torch.stack)
         #: |k| in units of the smallest wavenumber
         self.shell = torch.from_numpy(np.sqrt(self.spectral.index_squared))
-        #: factor from modes of a field to modes of its spline coefficients
+        #: factor that turns the modes of a field into those of its spline coefficients
         self.prefilter = torch.from_numpy(self.spline.inverse)
         #: number of times that a stored mode occurs in a sum over all modes
         self.multiplicity = torch.from_numpy(self.spectral.multiplicity)
@@ -64,9 +64,10 @@ class FourierGrid(ModeOperators):
         return _Interpolated.apply(self.to_fields(modes * self.prefilter), points.position, points)
 
     def spread(self, values: Tensor, points: Points) -> Tensor:
-        """Modes (c, kz, ky, kx) of a sum of splines around points with weights `values` (n, c); differentiable in both.
+        """Modes (c, kz, ky, kx) of the sum of the splines around points, each times its row of `values` (n, c).
 
-        It is the adjoint of `at` up to factors: the number of grid points and the multiplicity of modes.
+        Differentiable in values and positions. It is the adjoint of `at` up to factors: the number of grid points and
+        the multiplicity of modes.
         """
         return self.to_modes(_Spread.apply(values, points.position, points)) * self.prefilter
 
@@ -95,9 +96,9 @@ class FourierGrid(ModeOperators):
         return self.to_fields(modes).unflatten(0, (3, 3))
 
     def products(self, first: Tensor, second: Tensor) -> Tensor:
-        """Modes (6, kz, ky, kx) of the symmetric products a_i b_j of fields (3, ..., z_local, y, x).
+        """Modes (6, kz, ky, kx) of the products a_i b_j of two fields (3, ..., z_local, y, x), ij = xx, yy, zz, xy, ...
 
-        Axes between the component and the grid are summed over.
+        Products are summed over the axes between the component and the grid.
         """
         fields = [first[i] * second[j] for i, j in SYMMETRIC]
         return self.to_modes(torch.stack([field.sum(0) if field.dim() > 3 else field for field in fields]))
@@ -126,7 +127,7 @@ class Points:
         return torch.from_numpy(self._splines.at(parts)).to(self.position.device)
 
     def slope_along(self, parts: Sequence[np.ndarray], factors: Tensor) -> Tensor:
-        """Gradient (n, 3) of sum_c factors_c f_c with respect to the positions, the factors (n, c) held fixed."""
+        """Gradient (n, 3) by position of sum_c factors_c f_c, with interpolated fields f_c and fixed factors (n, c)."""
         return torch.from_numpy(self._splines.slope(parts, as_numpy(factors.double()))).to(self.position)
 
     def spread(self, values: Tensor) -> Tensor:

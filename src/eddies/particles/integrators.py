@@ -46,17 +46,17 @@ class Integrator:
 class VelocityVerlet(Integrator):
     """Kick-drift-kick velocity Verlet of second order, one evaluation of the rates a step.
 
-    Rates may depend on velocity and density. They are evaluated at the values v + dt a that an Euler step predicts for
-    the end of the step (Groot and Warren 1997, lambda = 1). The first half kick of the next step uses the same rates. A
-    density with a rate is integrated by the trapezoidal rule; a density that terms give is the last one evaluated. The
-    shift velocity is taken at the start of the step, which is of first order.
+    Rates may depend on velocity and density. They are evaluated with the velocity v + dt a, and the density, that an
+    Euler step predicts for the end of the step (Groot and Warren 1997, lambda = 1). The first half kick of the next
+    step uses the same rates. A density with a rate is integrated by the trapezoidal rule; a density that terms give is
+    the last one evaluated. The shift velocity is that at the start of the step, which is accurate to first order.
     """
 
     scheme = SCHEMES["verlet"]
 
     def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:
-        """Particles between two steps and their rates. They are evaluated, because `memory` holds rates at a predicted
-        velocity."""
+        """Particles between two steps and their rates. The rates are evaluated again, because `memory` holds those at a
+        predicted velocity."""
         if particles is not self._last:  # the last ones are on their ranks already
             particles, _ = self.dynamics.settle(particles)
         return particles, self.dynamics.rates(particles, time=self.dynamics.time)
@@ -72,9 +72,9 @@ class VelocityVerlet(Integrator):
 class CorrectedVerlet(Integrator):
     """Velocity Verlet that evaluates the rates again at the final velocity and density (Besold et al. 2000, DPD-VV).
 
-    Both evaluations have the same positions and share neighbour lists and weights. For rates that depend on velocity
-    alone it is Heun's method of second order, stable up to twice the step of velocity Verlet. The shift velocity is
-    taken at the start of the step, which is of first order.
+    Both evaluations have the same positions and share neighbour list and kriging weights. For rates that depend on
+    velocity alone the scheme is Heun's method of second order, stable up to twice the step of velocity Verlet. The
+    shift velocity is that at the start of the step, which is accurate to first order.
     """
 
     scheme = SCHEMES["corrected-verlet"]
@@ -91,7 +91,7 @@ class CorrectedVerlet(Integrator):
 class RungeKutta(Integrator):
     """An explicit Runge-Kutta scheme. Each stage begins at the start of the step, with the rates of the stage before:
 
-        k_s = f(y + c_s dt k_(s-1)),    y + dt sum_s b_s k_s,
+        k_s = f(y + c_s dt k_(s-1)),    y(t + dt) = y + dt sum_s b_s k_s,
 
     with nodes c and weights b. Particles change rank between stages. `memory` holds rates only after a call of `rates`.
     """

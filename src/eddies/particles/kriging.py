@@ -14,26 +14,27 @@ from eddies.kernels import kriging as compiled
 from eddies.kernels.library import library
 from eddies.particles.pairs import Pairs
 
-# Rows of weights: for the field; for its first derivatives; for its second derivatives xx, xy, xz, yy, yz, zz; for the
-# field and its first derivatives.
+# Rows of the weights for the field, for its first derivatives, for its second derivatives xx, xy, xz, yy, yz, zz, and
+# for the field together with its first derivatives.
 OWN, FIRST, SECOND, UP_TO_FIRST = 0, slice(1, 4), slice(4, 10), slice(0, 4)
 # Row in SECOND of each entry (j, k) of the matrix of second derivatives.
 PLACES = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 
-# Ratio of the noise variance to the field variance. The smallest distances between random particles require this value.
+# Ratio of the noise variance to the field variance. It must be so large because some random particles almost coincide.
 NOISE = 1e-3
-# Squared lengths of the Gaussians in the covariance: the smallest, in units of d^2/6 (white noise after the Gaussian
-# filter), and their number. Each is twice the one before.
+# The covariance is a sum of SCALES Gaussians. Each squared length is twice the one before. NARROWEST is the smallest,
+# in units of d^2/6, which is the squared length of white noise after the Gaussian filter.
 NARROWEST, SCALES = 1.2, 6
-# Smallest weight of a particle's own value, in units of the inverse variance of the field.
+# Smallest own weight of a particle by which a residual is divided, in units of the inverse variance of the field.
 LEAST_WEIGHT = 0.01
 
 
 def covariance(filter_width: float) -> tuple[float, np.ndarray]:
-    """Rate b and amplitudes a (m,) of C(r) = sum_m a_m exp(-b 2^m r^2), C(0) = 1.
+    """Rate b and amplitudes a (m,) of the covariance C(r) = sum_m a_m exp(-b 2^m r^2), C(0) = 1.
 
-    It is the covariance of a velocity with E(k) ~ k^(-5/3) after a Gaussian filter of width d. A spectrum k^(-5/3) is a
-    sum of Gaussians of lengths l with weights l^(2/3). None is narrower than d/sqrt(6), since E G^2 ~ exp(-k^2 d^2/12).
+    C belongs to a velocity with E(k) ~ k^(-5/3) after a Gaussian filter of width d. A spectrum k^(-5/3) is a sum of
+    Gaussians of lengths l with weights l^(2/3). After the filter no Gaussian is narrower than d/sqrt(6), since
+    E G^2 ~ exp(-k^2 d^2/12).
     """
     squares = [filter_width**2 / 6 * NARROWEST * 2.0**m for m in reversed(range(SCALES))]
     weights = [square ** (1 / 3) for square in squares]
@@ -41,11 +42,12 @@ def covariance(filter_width: float) -> tuple[float, np.ndarray]:
 
 
 def interpolated(pairs: Pairs, support: float, filter_width: float, values: Tensor) -> tuple[Tensor, Tensor]:
-    """Kriging at points that are no particles: field (n, c) and gradient (n, c, 3) from values (s, c) of the particles.
+    """Kriging at points that are not particles: field (n, c) and gradient (n, c, 3) from the particles' values (s, c).
 
-    The result is sum_j w_j f_j with weights as in `kriging_weights` and b_j = C(|x - x_j|), or its derivatives with
-    respect to x. The weights of the field add up to one and those of the gradient to zero, so a constant is exact. The
-    result is NaN where the equations cannot be solved, and zero where no particle lies within the support.
+    Both are sums sum_j w_j f_j with the weights of `kriging_weights`. For the field b_j is C(|x - x_j|), and for the
+    gradient the derivative of C(|x - x_j|) with respect to x. The weights of the field add up to one and those of the
+    gradient to zero, so a constant is exact. The result is NaN where the equations cannot be solved, and zero where no
+    particle lies within the support.
     """
     _, weights = kriging_weights(pairs, support, filter_width, sited=False)
     sums = torch.from_numpy(compiled.weighted_sums(library(), pairs.offsets.numpy(), pairs.sender.numpy(), None,
@@ -58,18 +60,19 @@ def kriging_weights(pairs: Pairs, support: float, filter_width: float,
                     sited: bool = True) -> tuple[np.ndarray, list[np.ndarray]]:
     """Kriging weights: the best linear estimate sum_j w_j f_j of a field and its derivatives, w = K^-1 b.
 
-    K_jk = C(|x_j - x_k|), `covariance`, plus the noise NOISE / max(1 - (r/support)^4, 1e-4) of each particle on the
-    diagonal. r is its distance; the noise is so large at the support that neighbours enter and leave without a jump. If
-    the receiver is a particle (`sited`), its own value f_i is among the f_j. In the row of the field b is then 1 for
+    K_jk is C(|x_j - x_k|) (see `covariance`), plus NOISE / max(1 - (r/support)^4, 1e-4) on the diagonal. This noise
+    of a particle grows with its distance r from the receiver, so neighbours enter and leave the support without a jump.
+    If the receiver is a particle (`sited`), its own value f_i is among the f_j. In the row of the field b is then 1 for
     the particle and 0 for its neighbours. This row gives w_i times the difference between f_i and the neighbours'
     estimate. In the rows of derivatives b is the derivative of C(|x - x_j|) with respect to x. The mean of f is
-    unknown. A multiple of K^-1 1 is subtracted so that the weights add up to zero (ordinary kriging).
+    unknown: a multiple of K^-1 1 is subtracted so that the weights add up to zero, or to one in the row of the field
+    if the receiver is not a particle (ordinary kriging).
 
     Returns
     -------
-    The particles' own weights (10, k), and ten arrays (m,) of the neighbours' weights: for the field, its first and its
-    second derivatives xx, xy, xz, yy, yz, zz. They are NaN where the equations cannot be solved or a receiver has more
-    than MOST_NEIGHBORS neighbours.
+    The receivers' own weights (10, k), and ten arrays (m,) of the neighbours' weights. The ten rows are those of the
+    field, its first derivatives, and its second derivatives xx, xy, xz, yy, yz, zz. Weights are NaN where the equations
+    cannot be solved or a receiver has more than MOST_NEIGHBORS neighbours.
     """
     displacement = np.ascontiguousarray(pairs.displacement.detach().cpu().T.numpy())
     return compiled.kriging_weights(library(), pairs.offsets.cpu().numpy(), displacement, support, NOISE,
@@ -83,7 +86,8 @@ class Kriging:
 
     Parameters
     ----------
-    pairs : of all owned particles with the `seen` particles that the rank sees, within `support`.
+    pairs : pairs of all owned particles with the particles that the rank sees, within `support`.
+    seen : number of particles that the rank sees.
     filter_width : d of the filter that the fields have passed.
     with_ghosts : appends the ghost rows to a column of the owned particles; collective.
     """

@@ -24,7 +24,7 @@ class Solution:
 
     Parameters
     ----------
-    modes : (3, kz, ky, kx).
+    modes : (3, kz, ky, kx), the solution.
     at_points : values (n, 3) of the modes at the points.
     iterations, left : number of iterations, and remaining squared residual.
     """
@@ -40,12 +40,13 @@ class LeastSquares:
 
         sum_i |v_i - u(x_i)|^2 + sum_k penalty_k |u(k)|^2
 
-    over solenoidal modes u (3, kz, ky, kx). B evaluates modes at points; P projects onto solenoidal modes `inside`.
+    over solenoidal modes u (3, kz, ky, kx). B evaluates modes at points. P projects onto the solenoidal modes that are
+    solved for.
 
     Parameters
     ----------
-    inside : (kz, ky, kx), the modes to solve for.
-    penalty : (kz, ky, kx), real, 0 for all other modes.
+    inside : bool (kz, ky, kx), whether a mode is solved for.
+    penalty : (kz, ky, kx), real, 0 for modes that are not solved for.
     """
 
     def __init__(self, grid: FourierGrid, inside: Tensor, penalty: Tensor) -> None:
@@ -60,9 +61,9 @@ class LeastSquares:
         return self.projected(self.grid.spread(values, points) * self.grid.spectral.cells**3)
 
     def descent(self, missing: Tensor, points: Points, modes: Tensor) -> Tensor:
-        """Half the negative gradient at modes u, P B^T (v - B u) - penalty u, from `missing` = v - B u (n, 3).
+        """Half the negative gradient of the minimised sum at modes u: P B^T (v - B u) - penalty u.
 
-        It vanishes at the minimum. Collective, differentiable.
+        `missing` is v - B u (n, 3). The result vanishes at the minimum. Collective, differentiable.
         """
         if torch.is_grad_enabled():
             return self.gathered(missing, points) - self.penalty * modes
@@ -78,7 +79,10 @@ class LeastSquares:
         return torch.where(self.inside, 1 / (count + SMOOTHING * self.penalty), 0.0)
 
     def size(self, residual: Tensor, count: float) -> float:
-        """Squared norm of a residual over all ranks, comparable to sum_i |v_i|^2; collective."""
+        """Squared norm of a residual on all ranks, with the preconditioner as weight; collective.
+
+        It is comparable to sum_i |v_i|^2.
+        """
         square = residual.real.square() + residual.imag.square()
         weighted = self.grid.multiplicity * self.preconditioner(count) * square
         return self._over_ranks(float(weighted.sum(dtype=torch.float64)))
@@ -89,7 +93,7 @@ class LeastSquares:
         """Solve A y = `right` by preconditioned conjugate gradients; collective.
 
         The iteration ends when the squared residual (`size`) is at most `enough`, or after `most` iterations. If
-        `iterations` is given, that many are taken instead.
+        `iterations` is given, the solve takes this number of iterations instead.
         """
         inverse, residual = self.preconditioner(count).numpy(), np.array(right.numpy(), order="C")
         modes, direction, passes = np.zeros_like(residual), inverse * residual, self._passes

@@ -23,7 +23,7 @@ from eddies.particles.terms.resolved_forces import Forcing
 from eddies.particles.terms.term import PairTerm, Term
 from eddies.scene.terms import TermError, TermSettings
 
-#: The built-in terms by their words in [model] terms: classes in the modules of eddies.particles.terms.
+#: The built-in terms by their words in [model] terms. Their classes are in the modules of eddies.particles.terms.
 TERMS: dict[str, type[Term]] = {
     kind.Settings.word: kind
     for module in iter_modules(built_in.__path__)
@@ -86,7 +86,7 @@ class LagrangianModel(nn.Module):
 
     @property
     def density_is_given(self) -> bool:
-        """Whether terms give the density that others read, instead of its rate."""
+        """Whether some terms give the density itself, not its rate, and others read it."""
         return self.reads_density and "density" in self.gives
 
     @property
@@ -96,7 +96,7 @@ class LagrangianModel(nn.Module):
 
     @property
     def learns_density(self) -> bool:
-        """Whether a density rate has learned parameters."""
+        """Whether a term that gives a density rate has learned parameters."""
         return any("density_rate" in term.settings.gives and list(term.parameters()) for term in self.terms.values())
 
     @property
@@ -124,8 +124,8 @@ class LagrangianModel(nn.Module):
         """Sum of the terms; differentiable, collective.
 
         The result has `acceleration` (k, 3), which includes `force_modes`, and `density_rate` (k,) and a shift if a
-        term gives them. A `density` that terms give is the whole density (n,), not its deviation. `kept` are
-        results of `linear_rates` that replace terms.
+        term gives them. A `density` that terms give is the whole density (n,), not its deviation. `kept` holds
+        results of `linear_rates` by name of the term; each replaces the evaluation of that term.
         """
         kept, sums = kept or {}, []
         for stage in self._stages if self.density_is_given and context.density is None else [list(self.terms.items())]:
@@ -154,8 +154,8 @@ class LagrangianModel(nn.Module):
     def check_terms(self, context: Context) -> None:
         """Raise TermError for a fault of a term that the shapes of its rates do not show; collective.
 
-        These are rates that are not finite, a change of the particles in place, a parameter without an effect on the
-        rates, and a term that declares itself linear and is not.
+        Such faults are rates that are not finite, a change of the particles in place, a parameter without an effect on
+        the rates, and a term that declares itself linear and is not.
         """
         columns = list(context.particles.columns().values())
         before = [column.clone() for column in columns]
@@ -203,7 +203,7 @@ class LagrangianModel(nn.Module):
             direct = self._with_parameters(term, context, others)
             context.forget_sums(term)
             expected = replace(kept, parameters=others).at(None)
-            # Norms over this rank's particles: at a single particle contributions may cancel to rounding.
+            # Norms over this rank's particles are compared: at a single particle only rounding errors may be left.
             wrong = [rate for rate in STORED if getattr(direct, rate) is not None and not (
                 (getattr(expected, rate) - getattr(direct, rate)).norm() <= 1e-3 * getattr(direct, rate).norm())]
             if any_rank(context.comm, bool(wrong)):
@@ -269,7 +269,7 @@ class LinearRates:
     Parameters
     ----------
     origin : rates with all parameters zero.
-    slopes : contribution of each parameter, by name of the rate, (parameters, n, ...).
+    slopes : by name of the rate, its derivative with respect to each parameter, (parameters, n, ...).
     parameters : the parameters of the term.
     """
 
@@ -294,7 +294,7 @@ class LinearRates:
 
 
 def _everywhere(term: Term) -> bool:
-    """Whether a sum over pairs is needed at all particles, since other terms read the density that it gives."""
+    """Whether a term is needed at all particles: it is a sum over pairs, and other terms read the density it gives."""
     return isinstance(term, PairTerm) and "density" in term.settings.gives
 
 

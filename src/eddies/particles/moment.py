@@ -16,7 +16,9 @@ from eddies.particles.rates import Rates
 
 @dataclass(frozen=True)
 class Moment:
-    """This rank's block of the list of all particles in the order of their ids. They may lie in any slab.
+    """This rank's block of all particles at a moment.
+
+    A block holds consecutive ids, in order; its particles may lie in any slab.
 
     Parameters
     ----------
@@ -38,7 +40,7 @@ class Moment:
 
     @classmethod
     def of(cls, comm: Comm, total: int, time: float, particles: ParticleSet, rates: Rates) -> Moment:
-        """Moment of particles on any ranks, `total` in all; collective."""
+        """Make a moment from particles on any ranks; `total` is their number over all ranks. Collective."""
         order = IdOrder(comm, as_numpy(particles.id), total)
         columns = {"position": particles.position, "velocity": particles.velocity, "acceleration": rates.velocity_rate,
                    "density": particles.density, "density_rate": rates.density_rate, "shift": rates.shift_velocity}

@@ -19,8 +19,8 @@ from eddies.particles.periodic_box import PeriodicBox, safe_norm
 class NeighborList:
     """All senders within `cutoff` + `skin` of each receiver.
 
-    The list is in compressed rows: the senders of receiver i are `senders[offsets[i]:offsets[i + 1]]`. It is symmetric
-    where the receivers are among the senders.
+    The list is in compressed rows: the senders of receiver i are `senders[offsets[i]:offsets[i + 1]]`. If i and j are
+    both receivers and senders, the list holds (i, j) and (j, i) or neither.
 
     Parameters
     ----------
@@ -45,13 +45,13 @@ class NeighborList:
         """
         if not (torch.isfinite(receivers).all() and torch.isfinite(senders).all()):
             raise ValueError("neighbour list: a position is not finite")
-        # Slightly too large: only `pairs` decides, equally for both orders of a pair, whether it is within the cutoff.
+        # A slightly larger radius: only `pairs` decides what is within the cutoff, alike for (i, j) and (j, i).
         reach = (self.cutoff + self.skin) * (1 + 1e-9)
         columns = neighbors_within(library(), self.box, reach, as_numpy(receivers), as_numpy(senders), exclude_self)
         self.offsets, self.senders = (torch.from_numpy(column).to(receivers.device) for column in columns)
 
     def blocks(self, together: int) -> Iterator[slice]:
-        """Yield consecutive receivers with about `together` listed pairs; one empty block if there are no receivers."""
+        """Yield slices of receivers, each with about `together` listed pairs; without receivers, one empty slice."""
         ends = self.offsets[1:]
         if not len(ends):
             yield slice(0, 0)

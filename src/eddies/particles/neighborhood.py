@@ -34,8 +34,10 @@ class LocalParticles:
         self._kriging: Kriging | None = None
 
     def fit(self, owned: Tensor) -> bool:
-        """Whether these quantities are still valid: the tensor of owned positions, halo and list have not changed, and
-        gradients are recorded as before or again not recorded. All ranks get the same answer."""
+        """Whether these quantities are still valid for the positions `owned`. All ranks get the same answer.
+
+        They are valid until the tensor of positions, the halo or the list changes, or until the recording of gradients
+        begins or ends."""
         return self._owned is owned and self._state == self._state_of(owned)
 
     def _state_of(self, owned: Tensor) -> tuple[int, int, bool]:
@@ -55,7 +57,7 @@ class LocalParticles:
         return self.neighborhood.neighbors
 
     def kriging(self, filter_width: float, dtype: torch.dtype) -> Kriging:
-        """Kriging among neighbours at all owned particles, for fields that have passed a filter."""
+        """Kriging among neighbours at all owned particles, for fields that have passed a filter of this width."""
         if self._kriging is None:
             position = self.position.detach()
             pairs = self.neighbors.pairs(position[: len(self._owned)], position, dtype=dtype)
@@ -91,7 +93,8 @@ class Neighborhood:
         return self._built_at if particles.id is self._ids else None
 
     def outdated(self, particles: ParticleSet) -> bool:
-        """Whether any rank has new particles, or a particle that has moved by more than half the skin or to NaN."""
+        """Whether, on any rank, the last build was for other particles, or one has moved since by more than half the
+        skin or to NaN."""
         distance = math.inf
         if particles.id is self._ids:
             moved = self.box.displacement(particles.position.detach(), self._built_at)
@@ -101,10 +104,10 @@ class Neighborhood:
     def update(self, particles: ParticleSet) -> None:
         """Rebuild halo and list if they are outdated. No particle changes rank.
 
-        Where a particle has left its slab, the halo is wider by the largest distance outside. Slabs must be thicker by
-        twice that distance: particles of both neighbouring ranks may enter a slab, and these ranks exchange no ghosts.
-        Raises HaloError on all ranks if slabs are too thin, a position is not finite, or a particle is farther outside
-        its slab than the box is long.
+        If particles are outside their slabs, the halo is wider by their largest distance from the slab, and slabs must
+        be thicker by twice that distance. Otherwise particles of the ranks below and above a slab could be neighbours
+        within it, and these two ranks exchange no ghosts. Raises HaloError on all ranks if slabs are too thin, a
+        position is not finite, or a particle is farther outside its slab than the box is long.
         """
         if not self.outdated(particles):
             return
@@ -119,7 +122,7 @@ class Neighborhood:
 
     @property
     def neighbors(self) -> NeighborList:
-        """The list of pairs, built when it is first used."""
+        """The neighbour list, built at its first use after an update."""
         if self._unlisted is not None:
             self._neighbors.build(self._unlisted[: len(self._built_at)], self._unlisted, exclude_self=True)
             self._unlisted = None

@@ -31,7 +31,7 @@ class Pairs:
     segment : int64 (m,), row of i in the output, in [0, count), not decreasing.
     sender : int64 (m,), row of j among the local particles (owned, then ghosts).
     displacement : (m, 3), x_i - x_j between nearest images.
-    distance : (m,), its length, with zero gradient where it vanishes.
+    distance : (m,), length of the displacement; its gradient is zero where the length is zero.
     count : number of output rows.
     """
 
@@ -54,7 +54,7 @@ class Pairs:
         return gather_rows(column, self.sender)
 
     def sum(self, values: Tensor) -> Tensor:
-        """Sum of pair values (m, ...) over the pairs of each output row: (count, ...). The order is fixed."""
+        """Sum of pair values (m, ...) over the pairs of each output row, in a fixed order: (count, ...)."""
         by_component = torch.atleast_2d(values.flatten(1).T if values.dim() > 1 else values).contiguous()
         sums = _SegmentSum.apply(by_component, self.offsets, self.segment)
         return sums.T.reshape(self.count, *values.shape[1:])
@@ -170,6 +170,7 @@ class CompiledSum:
     kind, numbers : name and constants of the sum in the library (kernels/summands.hpp).
     parameters : (p,), differentiable; none by default.
     scalars : columns (s,) of all particles that this rank sees, differentiable.
+    reads_velocity : whether the sum needs the velocities of the particles.
     """
 
     kind: str

@@ -26,15 +26,16 @@ from eddies.particles.smoothing_kernels import HermiteKernel, SmoothingKernel
 PAIRS_TOGETHER = 1 << 16
 # Number of pairs evaluated together in kriging, with ten weights per pair: enough receivers for all threads.
 KRIGED_TOGETHER = 1 << 20
-# Ridge of moving least squares. Values below 1e-4 change no error of a filtered field. For particles that move without
-# a force and gather, the ridge bounds the gradients.
+# Ridge of moving least squares. Smaller values do not change the errors of a filtered field. Where particles gather
+# because no force acts on them, the ridge bounds the gradients.
 RIDGE = 1e-4
 
 
 class ParticleField:
     """This rank's particles with the ghosts within `support`, and the grid points among them, on the host.
 
-    The grid has one cell for each plane of the slabs. Its points on this rank are numbered z slowest.
+    Along each axis the grid has one cell for each plane of the slabs. The numbers of its points on this rank vary
+    slowest with z.
 
     Parameters
     ----------
@@ -66,8 +67,8 @@ class ParticleField:
     def volumes_by_table(self, kernel: HermiteKernel) -> Tensor:
         """Volumes of all local particles (s,) for a tabulated kernel; collective, differentiable.
 
-        It stores the contribution of each table entry to each particle's sum, 8 bytes for each knot and particle. So it
-        is fast for many tables one after the other, as in training.
+        The method stores the contribution of each table entry to each particle's sum, 8 bytes for each knot and
+        particle. So it is fast for many tables one after the other, as in training.
         """
         if kernel.mean_volume is not None:
             return self.volumes(kernel)
@@ -80,7 +81,7 @@ class ParticleField:
         return with_ghosts(self.halo, 1 / (self._entries @ kernel.table))
 
     def on_grid(self, kernel: SmoothingKernel, volume: Tensor, rows: Tensor | slice) -> tuple[Tensor, Tensor]:
-        """Average velocity (k, 3) and its gradient (k, 3, 3) at some of this rank's grid points; differentiable."""
+        """Average velocity (k, 3) and its gradient (k, 3, 3) at the grid points `rows` of this rank; differentiable."""
         pairs = self._around.pairs(self.points, self._position, rows, self.dtype)
         return reconstruct_with_gradient(kernel, pairs, volume, self._velocity)
 
@@ -151,7 +152,7 @@ class ParticleField:
 
     @cached_property
     def _around(self) -> NeighborList:
-        """The particles around grid points."""
+        """Neighbour list of the particles around the grid points."""
         return self._neighbors_of(self.points)
 
     def _neighbors_of(self, receivers: Tensor) -> NeighborList:
@@ -163,7 +164,7 @@ class ParticleField:
 def grid_points(slab: SlabDecomposition, cells: int) -> Tensor:
     """Points (m, 3) of a grid of `cells`^3 that lie in this slab, z slowest."""
     axis = torch.arange(cells, dtype=torch.float64) * (slab.length / cells)
-    # In integers: rounded coordinates would assign points on the faces of slabs arbitrarily.
+    # The limits are found in integers: rounded coordinates would assign points on the faces of slabs arbitrarily.
     first, end = (-(-plane * cells // slab.planes) for plane in (slab.start, slab.stop))
     z, y, x = torch.meshgrid(axis[first:end], axis, axis, indexing="ij")
     return torch.stack([x.flatten(), y.flatten(), z.flatten()], dim=1)

@@ -13,7 +13,7 @@ BY_PARTICLE = ("acceleration", "density_rate", "shift_velocity", "shift_accelera
 
 @dataclass(frozen=True)
 class Rates:
-    """Contributions of a term, each optional. Contributions of terms add up.
+    """Contributions of a term to the rates; each is optional. Contributions of several terms are added.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ class Rates:
     shift_velocity : (n, 3), velocity of the particles relative to the fluid, dx/dt = v + shift_velocity.
     shift_acceleration : (n, 3), change of the fluid velocity v at a particle due to the shift.
 
-    The sum of all modes is interpolated to the particles once.
+    Modes of all terms are added before they are interpolated to the particles.
     """
 
     acceleration: Tensor | None = None

@@ -1,4 +1,4 @@
-"""A resolved velocity with memory: the mean of the prior comes from a forecast from the previous moment."""
+"""A resolved velocity with memory: the mean of its prior is based on a forecast from the previous moment."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from eddies.particles.least_squares import LeastSquares
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.resolved_velocity import ResolvedVelocity
 
-ANGLE = 0.5  # u' k_c dt of a substep of the forecast
+ANGLE = 0.5  # largest u' k_c dt of a substep of the forecast
 
 
 @dataclass
 class RememberedVelocity:
     """Estimates the resolved velocity frame by frame, with a forecast from each frame to the next.
 
-    In a time dt the forecast f of a mode loses the fraction 1 - beta of its reliability, beta = exp(-k u' dt / 2C). The
-    prior has the mean beta f and the variance  beta^2 V + (1 - beta^2) P.  P is the prior variance of the solver. V is
-    the variance of the previous estimate, 1/V = N/e + 1/(variance of its prior). This holds for N evenly spread
+    The correlation of a mode with its forecast f is assumed to decay in a time dt to beta = exp(-k u' dt / 2C). The
+    prior then has the mean beta f and the variance  beta^2 V + (1 - beta^2) P.  P is the prior variance of the solver.
+    V is the variance of the previous estimate, 1/V = N/e + 1/(variance of its prior). This holds for N evenly spread
     particles; e is the energy that the solver expects beyond its modes. So modes that few particles determine collect
     the information of several frames. Forecasts solve the Navier-Stokes equations for the velocity before the filter,
     in the modes of the solver.
@@ -35,7 +35,7 @@ class RememberedVelocity:
     ----------
     solver : estimates the first frame, which has no forecast. Its grid, prior and tolerance serve all frames.
     viscosity : nu.
-    transfer : G (kz, ky, kx) of the filter of the velocity that particles follow; 1 for the whole flow.
+    transfer : G (kz, ky, kx), transfer function of the filter of the particles' velocity; 1 without a filter.
     memory : C.
     weight : factor of the noise in the solver, sigma^2 / e; here a value below 1 is replaced by 1.
 
@@ -55,7 +55,10 @@ class RememberedVelocity:
 
     @torch.no_grad()
     def of(self, particles: ParticleSet, time: float) -> Tensor:
-        """Modes (3, kz, ky, kx) of the particles' velocity relative to its mean; each `time` is later than the last."""
+        """Modes (3, kz, ky, kx) of the particles' velocity relative to its mean.
+
+        `time` must be later than in the previous call.
+        """
         grid, comm = self.solver.grid, self.solver.grid.decomposition.comm
         mean = mean_over_ranks(comm, particles.velocity)
         relative = particles.velocity - mean
@@ -79,7 +82,8 @@ class RememberedVelocity:
         return modes
 
     def state_dict(self) -> dict[str, Any]:
-        """The state that the next moment needs: modes and penalty as tensors, and plain values."""
+        """State for the next moment, empty before the first: tensors `modes` and `penalty` of the latest estimate, and
+        plain values, its `time`, the particles' mean velocity `drift` and their number `count`."""
         if self._latest is None:
             return {}
         time, modes, drift = self._latest
@@ -118,7 +122,7 @@ class RememberedVelocity:
         return torch.where(inside, 1 / variance, 0.0)
 
     def _speed(self, modes: Tensor) -> float:
-        """The rms u' of a component; collective."""
+        """Rms u' of a velocity component, from modes of the velocity; collective."""
         grid = self.solver.grid
         square = grid.multiplicity * (modes.real.square() + modes.imag.square()).sum(0)
         return math.sqrt(float(global_sum(grid.decomposition.comm, float(square.sum(dtype=torch.float64)))) / 3)

@@ -23,18 +23,18 @@ from eddies.particles.neighborhood import farthest_outside
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.spectral.mode_operators import gaussian_transfer
 
-# Exponent of the prior's power law, the two constants of its dissipation range (Pope 2000, Eq. 6.248), and the factor
-# between the expected unresolved energy and the noise. The factor is measured in docs/closure.md.
+# Exponent of the prior's power law, the two constants of its dissipation range (Pope 2000, Eq. 6.248), and the ratio of
+# the noise to the expected unresolved energy. The ratio is measured in docs/closure.md.
 EXPONENT, DISSIPATION, DISSIPATION_ONSET, WEIGHT = 11 / 3, 5.2, 0.4, 100.0
 # Final residuals relative to the velocities, of a solve that starts from zero and of one that starts from a prediction.
 # A solve from zero leaves its residual in poorly determined modes; a solve from a prediction leaves it in all modes. At
 # twice the second value a forced flow diverged (docs/closure.md).
 TOLERANCE, TOLERANCE_PREDICTED = 2e-4, 1e-3
 # Final residual of the solve in the backward pass, relative to the incoming gradient. Gradients of a loss through four
-# frames then have an error of 2e-3, with half of the iterations of a tolerance of 2e-4.
+# frames then have an error of 2e-3, and the solve takes half as many iterations as with a tolerance of 2e-4.
 TOLERANCE_ADJOINT = 3e-3
 MOST_ITERATIONS = 300
-# Wavenumber shells in a band of the energy.
+# Number of wavenumber shells in each band of `band_energies`.
 BAND = 2
 
 
@@ -50,7 +50,7 @@ class ResolvedFlow:
     relative_velocity : (n, 3), their velocity minus its mean over all particles.
     filter_width : d of the filter that the particles' velocity has passed.
     left_over : (n, 3), the result of `missing` if it is known.
-    iterations, residual : of the solve; the residual is relative to the velocities.
+    iterations, residual : number of iterations of the solve, and its final residual relative to the velocities.
     converged : whether the residual reached its tolerance.
     """
 
@@ -117,9 +117,9 @@ class ResolvedFlow:
         return self._rms_of(self.unfiltered, self.grid.resolved / 2)
 
     def mean_square(self, modes: Tensor, above: float, below: float = math.inf) -> Tensor:
-        """Mean of u.u of a vector's modes with `above` < |k| < `below`, in units of the smallest wavenumber.
+        """Mean of u.u over space, from those modes of a vector u that have `above` < |k| < `below`.
 
-        Collective, differentiable.
+        The limits are in units of the smallest wavenumber. Collective, differentiable.
         """
         square = (modes.real.square() + modes.imag.square()).sum(0) * self.grid.multiplicity
         inside = (self.grid.shell > above) & (self.grid.shell < below)
@@ -136,17 +136,16 @@ class ResolvedVelocity:
         minimise  sum_i |v_i - u(x_i)|^2  +  sum_k (sigma^2 / P_k) |u(k)|^2
 
     as for measured particle tracks (Gesemann et al. 2016). The velocities v_i are relative to their mean over all
-    particles. P_k ~ k^(-11/3) f(k eta) G^2 is the expected energy of a mode, f the dissipation range of the spectrum,
-    G the transfer function of the filter. sigma^2 is `weight` times the energy of this law beyond k_c, which is noise
-    for the modes within. Since the filtered velocity is smooth and solenoidal, modes beyond the particles' Nyquist
-    wavenumber are determined too.
+    particles. P_k ~ k^(-11/3) f(k eta) G^2 is the expected energy of a component of a mode, f the dissipation range
+    of the spectrum, and G the transfer function of the filter. sigma^2 is `weight` times the energy of a velocity
+    component that this law predicts beyond k_c; this energy acts as noise on the modes within. Since the filtered
+    velocity is smooth and solenoidal, modes beyond the particles' Nyquist wavenumber are determined too.
 
-    Conjugate gradients, preconditioned by 1 / (N + 5 sigma^2/P_k), end when the preconditioned residual is `tolerance`
-    times the velocities, or after a given number of `iterations`. If the time of the evaluation is given, they start
-    from a prediction (`predicted`) and end at `tolerance_predicted`. In the backward pass they end at
-    `tolerance_adjoint`.
+    The solve uses conjugate gradients, preconditioned by 1 / (N + 5 sigma^2/P_k). It ends when the preconditioned
+    residual is `tolerance` times the velocities, or after a given number of `iterations`. A solve that starts from a
+    prediction (`predicted`) or from given modes ends at `tolerance_predicted`, a backward pass at `tolerance_adjoint`.
 
-    Products of modes above a third of the number of cells are aliased. For fields known at particles that error is far
+    Products of modes above a third of the number of cells are aliased. For fields known at particles this error is far
     below the error of the highest modes themselves.
 
     Parameters
@@ -245,11 +244,12 @@ class ResolvedVelocity:
         """Predict the modes at a time; None without earlier evaluations.
 
         The nearer of the last two evaluations at different times is extrapolated with the rates of both (Adams and
-        Bashforth). The field moves with the mean velocity (3,) of the particles. Each mode is reduced by its expected
-        error. In a time dt a velocity equal to the rms `speed` u' of a component turns the phase of a mode by theta =
-        k u' dt. The relative error of the prediction is then (5/12) theta^3; its rms over normally distributed
-        velocities is 1.6 theta^3. The factor 1 / (1 + (2 theta)^6) removes modes that velocities of two or three u'
-        would spoil. A wrong mode is worse than a missing one: it is corrected only near particles and grows elsewhere.
+        Bashforth). The field moves with the mean velocity (3,) of the particles. Each mode is multiplied by a
+        factor that decreases with its expected error. In a time dt a velocity equal to the rms `speed` u' of a
+        component turns the phase of a mode by theta = k u' dt. The relative error of the prediction is then (5/12)
+        theta^3; its rms over normally distributed velocities is 1.6 theta^3. The factor 1 / (1 + (2 theta)^6) removes
+        modes that velocities of two or three u' would spoil. A wrong mode is worse than a missing one: the solve
+        corrects it only near particles, and it grows elsewhere.
         """
         if not self._moments:
             return None
@@ -269,7 +269,8 @@ class ResolvedVelocity:
         self.speed = 0.0
 
     def state_dict(self) -> dict[str, Tensor]:
-        """State for later solves: times (m,), modes (m, 2, 3, kz, ky_local, kx) of velocity and rate, and the speed."""
+        """State for later solves: `times` (m,) of the stored moments, `modes` (m, 2, 3, kz, ky_local, kx) of velocity
+        and rate at these times, and `speed`."""
         modes = [torch.stack([moment.velocity, moment.rate]) for moment in self._moments]
         return {"times": torch.tensor([moment.time for moment in self._moments], dtype=torch.float64),
                 "modes": torch.stack(modes) if modes else self.grid.zeros(0, 2, 3),
@@ -359,7 +360,8 @@ def dissipation_range(k_eta: np.ndarray) -> np.ndarray:
 
 def _prior(grid: FourierGrid, filter_width: float, kolmogorov_length: float,
            inside: Tensor) -> tuple[Tensor, float]:
-    """Energy P_k of a component of each mode (kz, ky, kx), and the energy beyond k_c, for <v.v> = 1."""
+    """Energy P_k of each of the two solenoidal components of each mode (kz, ky, kx), and the energy beyond k_c, both as
+    parts of <v.v> = 1."""
     unit = 2 * math.pi / grid.decomposition.length
 
     def law(shell):

@@ -16,10 +16,10 @@ from torch import Tensor, nn
 
 from eddies.particles.dense_network import DenseNetwork
 
-# Sharpness C of the sigmoid in Eq. 7, with lengths in h, as in the public code; the text gives no number. The sigmoid
-# is 1/2 at r = h and 0.9 at r = 0.78 h.
+# Sharpness C of the sigmoid in Eq. 7, for lengths in units of h. The paper gives no number; its public code uses this
+# value. The sigmoid is 1/2 at r = h and 0.9 at r = 0.78 h.
 SIGMOID_SHARPNESS = 10.0
-# Knots of a table of the learned kernel.
+# Number of knots in a table of the learned kernel.
 KNOTS = 129
 
 
@@ -143,7 +143,7 @@ class HermiteKernel:
         return torch.cat([self.values, self.slopes])
 
     def in_table(self, distance: Tensor) -> tuple[Tensor, Tensor]:
-        """The four table entries at each distance (m,), and their factors in W(r): (4, m) each."""
+        """Indices of the four table entries that give W at each distance (m,), and their factors: (4, m) each."""
         inside, cell, t = self._locate(distance)
         last = t * t * (3 - 2 * t)
         factors = torch.stack([1 - last, last, t * (1 - t) ** 2 / self.cells, t * t * (t - 1) / self.cells])

@@ -74,7 +74,7 @@ def panels(rows: int, columns: int, size: tuple[float, float], right: float = 0.
 
 
 def legend_at_foot(figure: Figure, axis: Axes, columns: int) -> None:
-    """Put the legend of a panel at the foot of the figure, for which `panels` leaves room."""
+    """Put the legend of a panel at the foot of the figure, where `panels` leaves room by `foot`."""
     figure.legend(*axis.get_legend_handles_labels(), loc="lower center", ncols=columns)
 
 
@@ -91,7 +91,8 @@ def letter(axes: Sequence[Axes]) -> None:
 def png(figure: Figure) -> bytes:
     """Return the figure as a PNG image.
 
-    Logarithmic axes get plain text as labels, and no minor ticks over two decades or more: both save much time.
+    Logarithmic axes get plain text as labels. If they span two decades or more, they get no minor ticks. Both save
+    much time.
     """
     for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis) if axis.get_scale() == "log"):
         low, high = sorted(axis.get_view_interval())

@@ -21,9 +21,10 @@ SERIES = {"energy": "kinetic energy", "acceleration_rms": "rms of an acceleratio
 
 
 def averages(run: Frames, frames: np.ndarray, turnover: float, whose: str) -> dict[str, dict[str, float]]:
-    """Return for each of SERIES: mean, slope per turnover, standard errors of both, and standard deviation in time.
+    """Return statistics over frames for each name in SERIES.
 
-    The key of the mean is `whose`.
+    The keys are `whose` for the mean, "standard error", "trend per turnover", "error of the trend", and "deviation" for
+    the standard deviation in time.
     """
     blocks, found = Blocks.of(run.times[frames] / turnover, 1.0), {}
     samples = {"energy": np.array([mean_energy(run, frame) for frame in frames]),
@@ -36,14 +37,17 @@ def averages(run: Frames, frames: np.ndarray, turnover: float, whose: str) -> di
 
 
 def invariant_divergence(model: Sequence[Invariants], flow: Invariants) -> float:
-    """Forward KL divergence of the joint PDFs of Q and R over all frames, each frame in units of its own <Q_w>."""
+    """Forward KL divergence of the model's joint PDF of Q and R, over all its frames, from that of the flow.
+
+    Each frame is in units of its own <Q_w>.
+    """
     true_plane, *planes = (found.normalized(found.scale) for found in (flow, *model))
     bins = InvariantBins.covering(*true_plane)
     return kl_divergence(bins.probabilities(*true_plane), bins.probabilities(*np.concatenate(planes, axis=1)))
 
 
 def section(run: Rollout, span: StationarySpan) -> Section:
-    """Return the section. Averages are over the second half of the rollout before the model broke."""
+    """Return the section. Averages of the model are over the second half of the time before it broke."""
     shown, turnover = Section("forced", "Forced rollout beside the stationary state"), run.turnover
     frames = run.before_broken("model")
     if not len(frames):

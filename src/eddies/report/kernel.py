@@ -15,7 +15,7 @@ KERNELS = {  # name in the files: label, colour, line style
     "cubic_spline": ("cubic spline", DNS, "-."),
     "wendland": ("Wendland C$^2$", SECOND, ":"),
 }
-ERRORS = {  # name of a compared kernel or form in the files: start of the key in the report, name in words
+ERRORS = {  # name of a reconstruction in the files: start of its keys in the report, name in words
     "learned": ("", "learned kernel"),
     "learned_no_gradient": ("no_gradient_", "learned without L_g"),
     "cubic_spline": ("cubic_spline_", "cubic spline"),
@@ -28,7 +28,7 @@ ERRORS = {  # name of a compared kernel or form in the files: start of the key i
 
 @styled
 def shapes(kernels: Mapping[str, np.ndarray]) -> Figure:
-    """Draw h^3 W and h^4 dW/dr over r/h; columns r_over_h, value_NAME and derivative_NAME."""
+    """Draw h^3 W and h^4 dW/dr over r/h, from the columns r_over_h, value_NAME and derivative_NAME of KERNELS."""
     figure, axes = panels(1, 2, (4.4, 3.3))
     for axis, kind in zip(axes.flat, ("value", "derivative")):
         axis.axhline(0, color="#cccccc", linewidth=0.8)
@@ -46,7 +46,11 @@ def shapes(kernels: Mapping[str, np.ndarray]) -> Figure:
 
 @styled
 def reconstructed_planes(slices: Mapping[str, np.ndarray], errors: Mapping[str, float]) -> Figure:
-    """Draw planes [y, x] of u_x and du_x/dx, truth and reconstructions, with one colour scale per row."""
+    """Draw planes [y, x] of u_x and du_x/dx, truth and reconstructions, with one colour scale per row.
+
+    slices: truth_QUANTITY and QUANTITY_NAME for the quantities velocity and gradient and the names in KERNELS. errors:
+    QUANTITY_error_NAME.
+    """
     names = [name for name in KERNELS if f"velocity_{name}" in slices and name != "wendland"]
     figure, axes = panels(2, 1 + len(names), (2.665, 2.675), right=BAR, sharex=True, sharey=True)
     rows = (("velocity", "$u_x$"), ("gradient", r"$\partial u_x/\partial x$"))

@@ -1,4 +1,4 @@
-"""Learning curves: losses and validation error over a training."""
+"""Learning curves: losses and validation error over the steps of a training."""
 
 from collections.abc import Mapping
 

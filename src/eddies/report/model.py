@@ -21,7 +21,7 @@ ERRORS = (  # column of the table, label, colour, line style, marker
     ("density_rate_error", "density rate of the model", SECOND, "-", "^"),
     ("pressure_gradient_error", "exact filtered pressure gradient", DNS, "--", None),
 )
-EDGES = bin_edges(8, 65)  # of the PDFs, in standard deviations of the truth
+EDGES = bin_edges(8, 65)  # edges of the bins of the PDFs, in standard deviations of the truth
 METRICS = {  # key in the report: column of the table, label
     "acceleration_error": ("acceleration_error", "acceleration error at the true state (a priori)"),
     "true_density_acceleration_error": (
@@ -42,8 +42,8 @@ def section(description: Mapping[str, Any], table: Table, acceleration: Table, d
     """Return the section with the errors at the last frame, from the tables of the product.
 
     source: path of the run that the weights and the history come from; None if it is this run.
-    history: None if nothing was trained. others: the ground truths that the model was trained on, if that of this run
-    (or of the run `source`) is not among them.
+    history: None if nothing was trained. others: the ground truths that the model was trained on; empty if the ground
+    truth of this run, or of the run `source`, is among them.
     """
     last = int(np.argmax(table["delay"]))
     at = {name: float(values[last]) for name, values in table.items()}
@@ -80,7 +80,7 @@ def section(description: Mapping[str, Any], table: Table, acceleration: Table, d
 
 
 def training_metrics(description: Mapping[str, Any]) -> list[Metric]:
-    """Return the cost of the training and the validation error at the end of each phase."""
+    """Return wall time and steps of the training, and the validation error at the end of each phase."""
     if "training" not in description:
         return [Metric(key, label, None, "not stored with these weights") for key, label in TRAINING.items()]
     phases = description["training"]
@@ -106,7 +106,7 @@ def _written(coefficient: Mapping[str, Any]) -> str:
 
 def source_metrics(mach: float | None, errors: Table, source_mach: float | None,
                    source_errors: Table) -> list[Metric]:
-    """Return M_t and the mean error after the training window, of this flow and of the one that the weights come from.
+    """Return M_t and the mean error after the training window: of this flow, and of the flow that was trained on.
 
     errors, source_errors: the tables of a-priori errors. An M_t is None for an incompressible fluid.
     """

@@ -18,10 +18,11 @@ Number = float | int | bool | str | dict | None
 
 @dataclass(frozen=True)
 class Metric:
-    """One number of the report.
+    """One number of the report, or several.
 
-    key: its name in metrics.json. label: its name on the page. value: a number that is not finite becomes None.
-    reason: why there is no value. written: the text of the value on the page, if it differs from `shown(value)`.
+    key: its name in metrics.json. label: its name on the page. value: the number, or numbers by name; a number that is
+    not finite becomes None. reason: why there is no value. written: the text of the value on the page, if it differs
+    from `shown(value)`.
     """
 
     key: str
@@ -87,8 +88,8 @@ class Section:
 class RunRecord:
     """The run of a page: its name, its title and the text of its scene.
 
-    products: a header, then a row for each product. warnings: sentences on products that do not fit together. links:
-    title and relative path of other pages.
+    products: rows of a table, first a header, then one for each product. warnings: sentences on products that do not
+    fit together. links: title and relative path of other pages.
     """
 
     name: str
@@ -121,11 +122,11 @@ def metrics_json(warnings: Sequence[str], sections: Sequence[Section]) -> str:
 
 def write_page(output: Path, run: RunRecord, sections: Sequence[Section], images: Mapping[str, bytes],
                beside: Mapping[Path, str]) -> None:
-    """Write index.html, metrics.json, figures/NAME.png and the files `beside`, and remove older figures.
+    """Write index.html, metrics.json, figures/NAME.png and the files `beside`, texts by path; remove older figures.
 
     Raises OSError, or WriteError if a file cannot be written; then no file has changed.
     """
-    earlier = (output / "metrics.json").exists()  # figures of other programs stay
+    earlier = (output / "metrics.json").exists()  # without an earlier report all other figures stay
     (output / "figures").mkdir(parents=True, exist_ok=True)
     figures = {output / "figures" / f"{name}.png": image for name, image in images.items()}
     write_files({**figures, output / "index.html": render_page(run, sections, images),
@@ -136,7 +137,7 @@ def write_page(output: Path, run: RunRecord, sections: Sequence[Section], images
 
 
 def render_page(run: RunRecord, sections: Sequence[Section], images: Mapping[str, bytes]) -> str:
-    """Return the page as HTML. `images` holds PNG images by name of the figure; other figures are left out."""
+    """Return the page as HTML. `images` holds PNG images by name of the figure; figures without one are left out."""
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"shown": shown, "embedded": _embedded}
     template = environment.from_string(Path(__file__).with_name("page.html").read_text(encoding="utf-8"))
@@ -145,6 +146,7 @@ def render_page(run: RunRecord, sections: Sequence[Section], images: Mapping[str
 
 def _embedded(image: bytes) -> Markup:
     """Return the attributes of an HTML image that holds a PNG file."""
-    # Bytes 16 to 19 are its width. At 96 of 150 dots per inch the letters of all figures have the same size.
+    # Bytes 16 to 19 are the width in pixels. A figure has 150 dots per inch and the page 96: with this factor letters
+    # have the same size in all figures.
     width = int.from_bytes(image[16:20], "big") * 96 // 150
     return Markup(f'width="{width}" src="data:image/png;base64,{base64.b64encode(image).decode()}"')

@@ -1,4 +1,4 @@
-"""The section on fields reconstructed from tracks: errors over time and the last plane."""
+"""The report section on fields reconstructed from tracks: their errors over time, and a plane of the last frame."""
 
 from collections.abc import Mapping
 
@@ -17,10 +17,11 @@ ERRORS = {  # column of the table: label, colour, line style
 
 def section(about: Mapping[str, float | str], errors: Mapping[str, np.ndarray], of_fields: Mapping[str, np.ndarray],
             plane: np.ndarray | None) -> Section:
-    """Return the section from the tables of the product.
+    """Return the section on a product reconstruction.h5.
 
-    errors: columns over time with the error at tracks left out. of_fields: columns over time with errors of the fields;
-    empty if the true fields are not known. plane: u_x [y, x] at z = pi of the last frame.
+    about: its attributes, such as the method. errors: columns over time, with the error at tracks left out.
+    of_fields: columns over time with errors of the fields; empty if the true fields are not known. plane: u_x [y, x] at
+    z = pi in the last frame; None if the velocity is not stored.
     """
     both = {**{name: (of_fields["time"], of_fields[name]) for name in of_fields if name in ERRORS},
             **{name: (errors["time"], errors[name]) for name in errors if name in ERRORS}}
@@ -47,7 +48,7 @@ def section(about: Mapping[str, float | str], errors: Mapping[str, np.ndarray], 
 
 @styled
 def overview(errors: Mapping[str, tuple[np.ndarray, np.ndarray]], plane: np.ndarray | None) -> Figure:
-    """Draw errors over time and, if there is one, a plane of u_x. `errors` holds times and values by name."""
+    """Draw errors over time and, if given, a plane of u_x. errors: times and values of each error, by key of ERRORS."""
     figure, axes = panels(1, 1 if plane is None else 2, (4.4, 3.3), right=BAR)
     over_time = axes[0, 0]
     for name, (label, colour, style) in ERRORS.items():

@@ -1,4 +1,4 @@
-"""The section on a rollout: figures, and numbers at the last time that model and true tracers have in common."""
+"""The report section on a rollout: figures, and numbers at the last common time of model and true tracers."""
 
 from collections.abc import Mapping
 
@@ -15,7 +15,7 @@ from eddies.report.page import Metric, Section
 
 MAIN = ("turnovers", "energy_ratio", "velocity_error", "spectrum_error", "velocity_kl", "acceleration_kl",
         "qr_kl")
-# A description of each [simulation] method, filled in from the attributes of the rollout.
+# Description of each [simulation] method. The attributes of the rollout replace the names in braces.
 METHODS = {
     "learned": "the model, terms {terms}",
     "none": "no force: every particle keeps its velocity",
@@ -34,7 +34,7 @@ def moved_by(attributes: Mapping[str, float | str]) -> str:
 def section(run: Rollout, main: bool = True) -> Section:
     """Return the section with the paper's Figs. 4 to 9, Lagrangian statistics and disorder.
 
-    Without `main` the section has all numbers, but only the figures by which variants are compared.
+    If `main` is false, as on the page of a variant, the section has fewer figures, but still all numbers.
     """
     taken = "time_step" in run.attributes
     steps = f"time step {float(run.attributes['time_step']):.3g}" if taken else "no step was taken"
@@ -80,7 +80,7 @@ def section(run: Rollout, main: bool = True) -> Section:
 
 
 def _add_closure(shown: Section, solves: Mapping[str, np.ndarray]) -> None:
-    """Add numbers on the solves for the resolved velocity. The mean excludes the first frame, which starts from 0."""
+    """Add numbers on the solves for the resolved velocity. Means exclude the first frame, whose solve starts from 0."""
     count, failed = solves["solves"][1:].sum(), int(solves["not_converged"].sum())
     shown.metrics += [
         Metric("closure_iterations", "iterations of a solve for the resolved velocity, mean",
@@ -136,8 +136,7 @@ def _add_planes(shown: Section, run: Rollout, main: bool) -> None:
 
 
 def _add_invariants(shown: Section, run: Rollout, main: bool) -> None:
-    """Add joint PDFs of the invariants Q and R of the velocity gradient at the last common time, and their mean motion.
-    """
+    """Add joint PDFs of the invariants Q and R at the last common time and, if `main`, the mean rates of Q and R."""
     statistics = against_truth.last_invariants(run)
     shown.metrics += [
         Metric("qr_kl", "KL divergence of the Q–R joint PDF", statistics.divergence),
@@ -159,7 +158,7 @@ def _add_particles(shown: Section, run: Rollout, main: bool) -> None:
     model = against_truth.particle_series(run.model, np.arange(run.model.times.size))
     truth = against_truth.particle_series(run.truth, common.truth)
     ratio = float(model["energy"][common.model[-1]] / truth["energy"][-1])
-    # After half a turnover, or at the end if that is earlier.
+    # The early time is half a turnover, or the last common time if that is earlier.
     early = min(run.turnover / 2, float(errors["time"][-1]))
     early_error, early_without = (float(np.interp(early, errors["time"], errors[name]))
                                   for name in ("velocity_error", "no_force"))
@@ -240,7 +239,7 @@ def _add_paths(shown: Section, run: Rollout, main: bool) -> None:
 
 
 def _add_disorder(shown: Section, run: Rollout, main: bool) -> None:
-    """Add distances at the last common time, and the variance of counts over all frames before the model broke."""
+    """Add nearest-neighbour distances at the last common time, and the variance of counts while the model is finite."""
     both = {"model": run.model, "truth": run.truth}
     position = run.pair(-1, "position")
     distances = {name: disorder.distance_probabilities(getattr(position, name), run.length) for name in both}

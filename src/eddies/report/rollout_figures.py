@@ -16,14 +16,14 @@ from eddies.report.figures import (BAR, DNS, FILTERED, FOURTH, GUIDE, MODEL, POS
                                    draw_pdfs, guide_power_law, largest, legend_at_foot, letter, note,
                                    number_wavenumbers, panels, plain_log_ticks, show_plane, styled)
 
-FEWEST = 8  # particles that a cell of the plane of Q and R needs before its mean motion is drawn
+FEWEST = 8  # smallest number of particles in a cell of the Q-R plane for which its mean motion is drawn
 LINES = {"truth": {"label": "true tracers", "color": TRUTH},
          "model": {"label": "model", "color": MODEL, "linestyle": "--"}}
 
 
 @styled
 def velocity_planes(rows: Mapping[str, Sequence[Plane]], times: Sequence[float]) -> Figure:
-    """Draw u_x in planes [y, x], a row for each name and a column for each time in turnovers.
+    """Draw u_x in planes [y, x]. Each name has a row of panels, and each time (in turnovers) has a column.
 
     The planes of the first row determine the colour scale.
     """
@@ -72,7 +72,10 @@ def kinetic_energy(plane: Plane) -> np.ndarray:
 @styled
 def errors_over_time(model: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray],
                      errors: Mapping[str, np.ndarray], turnover: float) -> Figure:
-    """Draw energy, velocity error, PDF divergences and, if model and truth have one, density rms over time."""
+    """Draw energy, velocity error and PDF divergences over time, and the density rms if model and truth have a density.
+
+    model, truth: columns of `particle_series`. errors: columns of `error_series`.
+    """
     figure, axes = panels(2, 2, (4.6, 2.8))
     energy, error, divergence, density = axes.flat
     initial = truth["energy"][0]
@@ -105,7 +108,10 @@ def errors_over_time(model: Mapping[str, np.ndarray], truth: Mapping[str, np.nda
 
 @styled
 def particle_pdfs(pairs: Mapping[str, Sequence[Pair]], turnover: float) -> Figure:
-    """Draw PDFs of all components of "velocity" and "acceleration", given as a Pair of (n, 3) for each time."""
+    """Draw the PDFs of velocity and acceleration, with all three components in one PDF.
+
+    pairs: for "velocity" and "acceleration", a Pair of arrays (n, 3) for each time.
+    """
     times = len(pairs["velocity"])
     if times > 1:
         figure, axes = panels(2, times, (3.5, 2.6), foot=0.3, sharex="row", sharey="row")
@@ -127,10 +133,10 @@ def particle_pdfs(pairs: Mapping[str, Sequence[Pair]], turnover: float) -> Figur
 @styled
 def energy_spectra(series: Sequence[SpectraAt], flow: Mapping[str, np.ndarray], start_time: float, turnover: float,
                    filter_wavenumber: float) -> Figure:
-    """Draw spectra of model and true tracers over time with those of the DNS at the nearest time.
+    """Draw spectra of model and true tracers at several times, each with the DNS spectra of the nearest stored time.
 
-    `flow` is a table with time (m,), wavenumber (k,), energy and filtered (m, k). The times of the model count from
-    start_time.
+    `flow` is the table of DNS spectra, with the columns time (m,), wavenumber (k,), energy and filtered (m, k). Time 0
+    of `series` is the time `start_time` of this table.
     """
     size = (3.5, 3.2) if len(series) > 1 else (5.6, 3.6)
     figure, axes = panels(1, len(series), size, foot=0.3, sharex=True, sharey=True)
@@ -200,8 +206,8 @@ def particle_disorder(distances: Mapping[str, np.ndarray], counts: Mapping[str, 
                       turnover: float) -> Figure:
     """Draw the PDF of nearest-neighbour distances and the variance of counts over time.
 
-    distances: probabilities (bins,) on disorder.DISTANCE_EDGES of "truth" and "model". counts: columns time and
-    count_variance of both.
+    distances: for "truth" and "model", probabilities (bins,) of the bins disorder.DISTANCE_EDGES. counts: for both, the
+    columns time and count_variance.
     """
     figure, axes = panels(1, 2, (4.0, 3.1))
     edges = disorder.DISTANCE_EDGES
@@ -222,21 +228,21 @@ def particle_disorder(distances: Mapping[str, np.ndarray], counts: Mapping[str, 
 @styled
 def invariant_plane(statistics: InvariantStatistics,
                     flows: tuple[ConditionalVelocity, ConditionalVelocity] | None) -> Figure:
-    """Draw joint PDFs of (R, Q), and below them the conditional mean (dR/dt, dQ/dt) from `flows` of model and truth.
+    """Draw joint PDFs of (R, Q) and, if `flows` of model and truth are given, the mean (dR/dt, dQ/dt) at each (R, Q).
 
-    Arrows show directions on the page; colour is the speed |(dR/dt, dQ/dt)| in the units of the axes.
+    An arrow shows the direction of this mean on the page, and its colour the magnitude in the units of the axes.
     """
     names = "true tracers", "model"
     figure, axes = panels(1 if flows is None else 2, 2, (4.3, 3.2), right=BAR + 0.1, sharex=True, sharey=True)
     bins = statistics.bins
     across, up = _centres(bins.third)[-2], _centres(bins.second)[-2]
     densities = [bins.density(cells) for cells in (statistics.truth, statistics.model)]
-    # Levels are half a decade apart, from the peak of the truth down to the density of a single particle; at least two.
+    # Two to eight contour levels, half a decade apart, from the peak of the truth down to the density of one particle.
     peak, single = (np.log10(extreme) for extreme in (densities[0].max(), densities[0][densities[0] > 0].min()))
     top = np.floor(2 * peak)
     levels = 10.0 ** (np.arange(top, min(2 * single, top - 1.5), -1)[:8][::-1] / 2)
     for axis, density, name in zip(axes[0], densities, names):
-        # The outer cells also count all values beyond them. An empty cell has no logarithm.
+        # Outer cells are not drawn, because they also count all values beyond. Empty cells get a value above 0.
         shown = np.maximum(density[1:-1, 1:-1], 1e-3 * levels[0])
         filled = axis.contourf(_centres(bins.third)[1:-1], _centres(bins.second)[1:-1], shown, levels, cmap="YlGnBu",
                                norm=LogNorm(levels[0], levels[-1]), extend="max")

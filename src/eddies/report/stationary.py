@@ -1,4 +1,4 @@
-"""The section on the stationary state of forced turbulence: averages beside those of the literature."""
+"""The report section on the stationary state of forced turbulence: averages, and values from the literature."""
 
 from collections.abc import Mapping
 
@@ -17,9 +17,9 @@ HISTORY = (("dissipation_rate", r"dissipation", TRUTH, "-"), ("injection_rate", 
 
 @styled
 def stationary_state(statistics: Mapping[str, np.ndarray], span: StationarySpan) -> Figure:
-    """Draw energy and its rates over turnovers, components of the energy, and the compensated mean spectrum of a span.
+    """Draw the energy balance and the energy of each component over turnovers, and the compensated mean spectrum.
 
-    statistics: columns (samples,) of the whole run.
+    statistics: columns (samples,) of the whole run. span: its stationary part, over which the spectrum is averaged.
     """
     figure, axes = panels(1, 3, (3.6, 3.3), below=0.22)
     turnovers, (first, last) = statistics["turnovers"], span.columns["turnovers"][[0, -1]]
@@ -46,7 +46,7 @@ def stationary_state(statistics: Mapping[str, np.ndarray], span: StationarySpan)
 def draw_compensated(axis: Axes, spans: Mapping[str | None, tuple[StationarySpan, str]]) -> None:
     """Draw the compensated mean spectrum of each span, and a band for Kolmogorov's constant.
 
-    spans: span and colour by label.
+    spans: a span and the colour of its curve, by label; the legend leaves out the label None.
     """
     for label, (span, colour) in spans.items():
         k_eta, compensated = span.compensated_spectrum()
@@ -76,7 +76,7 @@ def section(statistics: Mapping[str, np.ndarray], span: StationarySpan) -> Secti
 
 
 def columns_of(row: Row) -> dict[str, float | str]:
-    """Return a row as values by column; missing values are left out."""
+    """Return the values of a row by the title of their column, without missing values."""
     columns = {"this run": row.value, "standard error": row.error, "deviation": row.deviation,
                "literature": row.literature, "source": row.source}
     return {name: value for name, value in columns.items() if value not in (None, "")}

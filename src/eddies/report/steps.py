@@ -1,4 +1,4 @@
-"""The section on the search for the time step of a rollout."""
+"""The report section on the search for the time step of a rollout."""
 
 from collections.abc import Mapping
 
@@ -10,11 +10,14 @@ from eddies.report.page import Metric, Section
 
 NO_CHANGE = 1e-16  # drawn for a change of 0, which a logarithmic axis cannot show
 
-Trials = Mapping[str, Mapping[str, np.ndarray]]  # columns (trials,) by integrator, each step half the one before
+Trials = Mapping[str, Mapping[str, np.ndarray]]  # by integrator: columns (trials,), each step half the previous
 
 
 def section(found: Mapping[str, float | str], trials: Trials) -> Section:
-    """Return the section with the chosen step, all trials and the cost of the search."""
+    """Return the section with the chosen step, all trials and the cost of the search.
+
+    found: attributes of the chosen step and of the search, from the group `found` of step.h5.
+    """
     size = "Courant number" if found["integrator"] == "etdrk4" else "time step"
     metrics = [Metric(f"{name}_{step:.4g}", f"{name}, {size} {step:.4g}", {
         "error": error, "change from twice the step": change, "seconds a turnover": seconds})
@@ -35,7 +38,10 @@ def section(found: Mapping[str, float | str], trials: Trials) -> Section:
 
 @styled
 def convergence(found: Mapping[str, float | str], trials: Trials, size: str) -> Figure:
-    """Draw the change by halving the step against the step, and the error against the seconds per turnover."""
+    """Draw two panels: the change of the final velocities when a step is halved, and the error over the run time.
+
+    size: name of the step, for the axis.
+    """
     figure, ((change, error),) = panels(1, 2, (4.6, 3.1), foot=0.3)
     for name, columns in trials.items():
         changes = np.maximum(columns["difference"][1:], NO_CHANGE)
@@ -48,7 +54,7 @@ def convergence(found: Mapping[str, float | str], trials: Trials, size: str) -> 
     change.set(title="Change by halving the step", xlabel=size, ylabel="rms change / rms velocity")
     error.set(title="Error over run time", xlabel="seconds per turnover", ylabel="rms error / rms velocity")
     plain_log_ticks(change.xaxis, error.xaxis, error.yaxis)
-    for axis in (change.xaxis, change.yaxis, error.xaxis, error.yaxis):  # trials may lie close together
+    for axis in (change.xaxis, change.yaxis, error.xaxis, error.yaxis):  # leave room: trials may be close
         low, high = axis.get_data_interval()
         axis.set_view_interval(low / 2, high * 2, ignore=True)
     legend_at_foot(figure, change, 5)

@@ -1,4 +1,4 @@
-"""The section on the tracers of the ground truth."""
+"""The report section on the tracers of the ground truth."""
 
 from collections.abc import Mapping
 
@@ -18,10 +18,10 @@ TOO_FEW = "there are too few frames, or too few pairs of tracers"
 
 def section(found: TracerStatistics, scales: Mapping[str, float], power: float | None,
             filtered: bool = True) -> Section:
-    """Return the section. `scales` are those of the flow at the release; `power` is the forcing power per mass, None if
-    it is unknown.
+    """Return the section on the tracers.
 
-    filtered: whether the tracers follow the filtered flow, not the whole flow.
+    scales: scales of the flow at the release of the tracers. power: forcing power per mass; None if it is unknown.
+    filtered: whether the tracers follow the filtered flow; otherwise they follow the whole flow.
     """
     kurtosis, (first, last) = found.kurtosis, found.energy_ratio[[0, -1]]
     metrics = [
@@ -62,10 +62,10 @@ def section(found: TracerStatistics, scales: Mapping[str, float], power: float |
 
 @styled
 def tracers(found: TracerStatistics, scales: Mapping[str, float]) -> Figure:
-    """Draw energy relative to the field, acceleration PDF, structure function and pair dispersion.
+    """Draw the ratio of tracer to field energy, the acceleration PDF, the structure function and the pair dispersion.
 
-    scales: of the flow at the release, the attributes `reference` of a ground truth. Units are those of Kolmogorov, or
-    of the large eddies if there is no viscosity.
+    scales: attributes `reference` of a ground truth, measured at the release of the tracers. Units are those of
+    Kolmogorov, or of the large eddies if there is no viscosity.
     """
     viscous = scales["viscosity"] > 0
     time_unit, time_name = (scales["kolmogorov_time"], r"t_\eta") if viscous else (scales["eddy_turnover_time"], "T")
@@ -113,6 +113,6 @@ def _energy_panel(axis: Axes, found: TracerStatistics, turnover: float) -> None:
 
 
 def _guide(axis: Axes, x: np.ndarray, law: np.ndarray, highest: float, label: str | None = None) -> None:
-    """Draw a dashed law up to the highest measured value."""
+    """Draw a law as a dashed line, where it is not above `highest`, the largest measured value."""
     below = law <= highest
     axis.loglog(x[below], law[below], color=DNS, linestyle="--", linewidth=1, label=label)

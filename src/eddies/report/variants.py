@@ -1,4 +1,4 @@
-"""The section on all variants of a scene: error against run time, and a table of all numbers."""
+"""The report section on all variants of a scene: error against run time, and a table of all numbers."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ Row = Mapping[str, Any]
 KEY = "variants"
 COST = "wall_seconds"
 MARKERS = list(zip((MODEL, TRUTH, SECOND, FOURTH, THIRD, DNS, FILTERED), "os^DvPX"))
-# Columns of the table after the measures: key in the rows, title.
+# Titles of the table columns that follow the measures, by their key in the rows.
 COSTS = {"end": "end of the rollout (T)", "stopped_at": "became unstable at (T)", "wall_seconds": "wall seconds per T",
          "wall_seconds_low": "wall seconds, lower quartile", "wall_seconds_high": "wall seconds, upper quartile",
          "core_seconds": "core seconds per T", "seconds_per_step": "seconds per step", "time_step": "time step",
@@ -33,18 +33,21 @@ COSTS = {"end": "end of the rollout (T)", "stopped_at": "became unstable at (T)"
          "training_steps": "training (steps)", "step_seconds": "search for the step (s)",
          "break_even_simulation": "cheaper than the direct simulation after (T)",
          "break_even_grid": "cheaper than the cheapest grid of equal or smaller error at T/2 after (T)"}
+MOST_NAMED = 20
 LEGEND = ("Wall seconds per turnover T, with the quartiles of the time of a step as bars. Bars of errors are standard "
           "deviations over realisations, if there are several. Dashed line: Pareto front, the variants that no other "
-          "one beats in both error and time. Crosses at the top: variants that became unstable, at the time given.")
+          f"one beats in both error and time. In a panel with more than {MOST_NAMED} variants, coarse grids off the "
+          "front have no names. Crosses at the top: variants that became unstable, at the time given.")
 CAPTION = ("In the table, spectrum errors, energies and KL divergences (nats) are those at the end of the rollout, "
            "for stable variants only. T is the eddy turnover time at the release of the tracers.")
 
 
 @dataclass(frozen=True)
 class ErrorAgainstTime:
-    """A row of numbers by key for each variant, and the name of the variant (`subject`) that others are compared with.
+    """The errors and run times of all variants.
 
-    A number that is missing is None. simulation_seconds: wall seconds of a turnover of the direct simulation.
+    rows: the numbers of each variant by key; a missing number is None. subject: name of the variant with which the
+    others are compared. simulation_seconds: wall seconds of the direct simulation per turnover; None if unknown.
     """
 
     rows: Sequence[Row]
@@ -53,7 +56,7 @@ class ErrorAgainstTime:
 
     @property
     def drawn(self) -> list[str]:
-        """The measures of DRAWN that some row has.
+        """The measures of DRAWN that at least one stable variant with a run time has.
 
         If no rollout reaches T/2, the velocity error at the end replaces the one at T/2.
         """
@@ -68,7 +71,7 @@ class ErrorAgainstTime:
 
     @property
     def summary(self) -> list[str]:
-        """Sentences: where the subject is worth its cost, and which coarse grid is as accurate.
+        """Sentences: in which measures the subject is worth its cost, and the cheapest grid that is as accurate.
 
         A variant that became unstable is treated as one without numbers.
         """
@@ -89,7 +92,7 @@ class ErrorAgainstTime:
         return [row for row in self.rows if is_stable(row) and None not in (row[measure], row[COST])]
 
     def stopped(self) -> list[Row]:
-        """Rows of variants that became unstable and have a time."""
+        """Rows of variants that became unstable and have a run time."""
         return [row for row in self.rows if not is_stable(row) and row[COST] is not None]
 
 
@@ -117,8 +120,10 @@ def _notice(row: Row) -> str:
 
 
 def _with_spread(row: Row, column: str) -> Any:
-    """Return a number of a row, with its standard deviation over realisations if known; "not stored" for the cost of a
-    training that the file of the model lacks."""
+    """Return a number of a row, with its standard deviation over realisations if known.
+
+    If the file of a trained model lacks the cost of its training, this cost is "not stored".
+    """
     if column in ("training_seconds", "training_steps") and row[column] is None and row["weights"] is not None:
         return "not stored"
     spread = row.get(f"{column}_spread")
@@ -137,7 +142,7 @@ def scatter(table: ErrorAgainstTime, measures: Sequence[str]) -> Figure:
     across = 5  # entries in a line of the legend
     figure, axes = panels(-(-len(measures) // columns), columns, (5.4, 4.2) if columns == 2 else (9.3, 6.0),
                           foot=0.15 + 0.2 * -(-len(styles) // across))
-    FigureCanvasAgg(figure)  # measures the names of points
+    FigureCanvasAgg(figure)  # needed to measure the names of points
     for axis in axes.flat[len(measures):]:
         axis.remove()
     for axis, measure in zip(axes.flat, measures):
@@ -169,7 +174,9 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
               linestyle="--", linewidth=1.2, zorder=1)
     axis.set(xlabel="wall seconds per turnover T", ylabel=in_symbols(MEASURES[measure]))
     places = [(row[COST], row[measure]) for row in rows] + [(row[COST], _top(axis)) for row in stopped]
-    names = [row["label"] for row in rows] + [f"{row['label']} {row['stopped_at']:.2g} T" for row in stopped]
+    names = [row["label"] if len(rows) <= MOST_NAMED or not row["on_grid"] or index in front else ""
+             for index, row in enumerate(rows)]
+    names += [f"{row['label']} {row['stopped_at']:.2g} T" for row in stopped]
     if places:
         name_points(axis, places, names, [row["name"] == table.subject for row in [*rows, *stopped]])
 
@@ -190,29 +197,31 @@ def _set_limits(axis: Axes, costs: Sequence[float], errors: Sequence[float]) -> 
 
 
 def _top(axis: Axes) -> float:
-    """Return the height of unstable variants, below the upper edge."""
+    """Return the y value at which unstable variants are drawn, a little below the upper edge."""
     low, high = np.log10(axis.get_ylim())
     return 10 ** (high - 0.03 * (high - low))
 
 
 def name_points(axis: Axes, points: np.ndarray, names: Sequence[str], bold: Sequence[bool]) -> list[Bbox]:
-    """Write a name beside each point (n, 2) of a panel with fixed limits, and return the boxes of the names, in pixels.
+    """Write a name beside each of the points (n, 2) of a panel with fixed limits. Return the names' boxes in pixels.
 
     Each name takes the nearest height, to the right or left of its point, at which it covers no other name or point. A
-    thin line ties a name that is far away to its point.
+    thin line connects a distant name with its point. Empty names are not written.
     """
     renderer, reach, frame = axis.figure.canvas.get_renderer(), 5 * axis.figure.dpi / 72, axis.bbox
     taken = [Bbox([pixel - reach, pixel + reach]) for pixel in axis.transData.transform(points)]
     heights = sorted(range(-150, 151, 3), key=abs)
     line = {"arrowstyle": "-", "color": "#8a8a8a", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3}
     for point, name, heavy in zip(points, names, bold):
+        if not name:
+            continue
         text = axis.annotate(name, point, xytext=(0, 0), textcoords="offset points", va="center", fontsize=8.5,
                              fontweight="bold" if heavy else "normal", arrowprops=line, annotation_clip=False, zorder=5,
                              path_effects=[patheffects.withStroke(linewidth=2, foreground="white")])
         for height, (side, alignment) in product(heights, ((1, "left"), (-1, "right"))):
             text.set(position=(side * (8 + abs(height) / 4), height), horizontalalignment=alignment)
             text.update_positions(renderer)
-            box = Text.get_window_extent(text)  # without the line, which the annotation's own extent includes
+            box = Text.get_window_extent(text)  # the annotation's own extent includes the line
             inside = frame.x0 <= box.x0 and box.x1 <= frame.x1 and frame.y0 <= box.y0 and box.y1 <= frame.y1
             if inside and not any(box.overlaps(other) for other in taken):
                 break

@@ -1,7 +1,7 @@
-"""The verdict, the first section of a report: a mark for each main number, by fixed limits.
+"""The verdict of a report: it marks each main number as good, fair or poor.
 
-All methods are judged alike. An error is compared with the limits of its measure or, where they are wider, with
-multiples of the error that samples of the truth itself have.
+The largest good error and the largest fair error are the same for all methods. They are fixed, or multiples of the
+error of a baseline. Where samples of the truth itself have an error, the limits are at least multiples of that error.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,25 +17,25 @@ ORDER = ("variants", KEY, "rollout", "forced", "step", "model", "reconstruction"
          "stationary", "tracers")
 OPEN = ("variants", KEY, "rollout", "forced")
 
-# Each pair is the largest error that is good and the largest that is fair.
+# Each pair holds the largest error that counts as good and the largest that counts as fair.
 BESIDE_NO_FORCE = BESIDE_GRADIENT = (0.2, 0.5)  # times the error of the baseline
 BESIDE_TEXTBOOK = (0.95, 1.05)  # times the error of the better kernel that needs no training
 ENERGY = (0.03, 0.1)            # relative deviation from the truth
 SPECTRUM = (0.05, 0.2)          # rms of ln(E/E_filtered)
-DIVERGENCE = (0.002, 0.02)      # nats; as between normal distributions whose deviations differ by 4 % and 14 %
+DIVERGENCE = (0.002, 0.02)      # nats; normal distributions whose deviations differ by 4 % and 14 % have these values
 FLOORS = (2.0, 5.0)             # times the error of samples of the truth itself
-LEAST_BASELINE = 0.1            # smallest error without any force for which velocities are judged
+LEAST_BASELINE = 0.1            # velocities are judged if their error without any force is at least this
 KERNEL_WORDS = {GOOD: "better than", FAIR: "no improvement over", POOR: "worse than"}
 TEXTBOOK = {"cubic_spline": "cubic spline", "wendland": "Wendland kernel"}
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A number and its mark.
+    """A number of the report and its mark: good, fair or poor.
 
-    `error` is compared with `good` and `fair`, the largest errors with these marks. `within` writes these limits for
-    the table. `words` name the number in the table, `short` names it in sentences, `baseline_text` describes the
-    baseline.
+    `error` is compared with `good` and `fair`, the largest errors with these marks. `within` is the format of these two
+    in the table. `words` is the name of the number in the table, and `short` its name in sentences. `baseline_text`
+    describes the baseline. If `judged` is false, the number gets no mark.
     """
 
     key: str
@@ -78,7 +78,7 @@ def arranged(sections: Sequence[Section], warned: bool) -> list[Section]:
 
 
 def section(sections: Mapping[str, Section], warned: bool) -> Section:
-    """Return the verdict on a run from the numbers of its sections, by key."""
+    """Return the verdict on a run from the numbers in `sections`, the other sections of its page by key."""
     numbers = {key: {metric.key: metric.value for metric in each.metrics} for key, each in sections.items()}
     rollout, model, kernel = (numbers.get(key, {}) for key in ("rollout", "model", "kernel"))
     of_rollout, of_model, of_kernel = [*_rollout(rollout)], [*_model(model)], [*_kernel(kernel)]

@@ -1,7 +1,7 @@
-"""The cross-checks of a scene: values that are allowed on their own, but not together.
+"""The cross-checks of a scene: they find values that are allowed on their own, but not together.
 
-Each check compares some sections when a scene is made, before any work. It yields pairs of the key at fault,
-"section.key", and a text with the reason and a remedy.
+The checks run when a scene is made. Each check compares some sections and yields its problems. A problem is a pair of
+the key at fault, "section.key", and a text with the reason and a remedy.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ REQUIRED = {"fluid": ("nonlinear", "linear", "linear_function", "combine", "comp
 RESERVED = ("report", "vtkhdf", "lagrangebench", "STOP", "LOCK")
 REALISATION = "realisation-"
 NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{,99}"
-# Keys that a variant must share with the scene, each with the reason. The keys of STARTS count only if rollouts start
-# after the training window.
+# Keys that must have the same value in a variant and in the scene, each with the reason. For the keys of STARTS this
+# holds only if rollouts start after the training window.
 SAME_TIMES = "all variants start at the same moment and are compared at the same times; change it for the whole scene"
 SAME_START = ("rollouts start after the training window, and all must start at the same moment; give the scene a "
               "[simulation] start")
@@ -62,7 +62,7 @@ def problem_of_name(variant: str) -> str:
 
 
 def check_foreign(flow: Flow, initial: Initial, simulation: Simulation | None, model: Model | None) -> Problems:
-    """Yield import paths that cannot be loaded, or whose class lacks an attribute. `Model` checks the terms."""
+    """Yield a problem if an import path cannot be loaded, or its class lacks an attribute. `Model` checks the terms."""
     sections: dict[str, Section | None] = {"flow": flow, "initial": initial, "simulation": simulation}
     if model:
         sections |= {f"model.{name}": settings for name, settings in model.settings.items()}
@@ -81,7 +81,7 @@ def check_foreign(flow: Flow, initial: Initial, simulation: Simulation | None, m
 
 
 def check_flow(flow: Flow, initial: Initial, forcing: Forcing | None, model: Model | None) -> Problems:
-    """Yield problems of the sound speed, of the initial flow and its keys, and of wavenumbers beyond the grid's."""
+    """Yield problems of the sound speed, initial flow and its keys, and wavenumbers that the grid cannot resolve."""
     if flow.compressible and flow.sound_speed is None:
         yield "flow.sound_speed", "this key is missing; a compressible fluid needs a number above 0"
     if not flow.compressible and flow.sound_speed is not None:
@@ -109,7 +109,7 @@ def check_flow(flow: Flow, initial: Initial, forcing: Forcing | None, model: Mod
 
 def check_time(time: Time, flow: Flow, forcing: Forcing | None, spin_up: SpinUp | None,
                tracers: Tracers | None) -> Problems:
-    """Yield a run time that is missing or given twice, an impossible stationary span, and forcing that never acts."""
+    """Yield problems of the run time (missing or given twice), the stationary span, and forcing that never acts."""
     if tracers is None and time.duration is None:
         yield "time.duration", "this key is missing; without [tracers] it is the run time, a number above 0"
     if tracers is not None and time.duration is not None:
@@ -142,7 +142,7 @@ def check_tracers(tracers: Tracers, flow: Flow, initial: Initial) -> Problems:
 
 
 def check_filtered(tracers: Tracers, present: Collection[str]) -> Problems:
-    """Yield tracers of the unfiltered velocity in a scene with a kernel, a model or a rollout."""
+    """Yield a problem if tracers follow the unfiltered velocity in a scene with a kernel, a model or a rollout."""
     made = [f"[{name}]" for name in ("kernel", "model", "training", "simulation") if name in present]
     if not tracers.filtered and made:
         yield "tracers.filtered", ("these particles follow the unfiltered velocity, but kernels, models and rollouts "
@@ -150,7 +150,7 @@ def check_filtered(tracers: Tracers, present: Collection[str]) -> Problems:
 
 
 def check_sets(tracers: Tracers, variants: Collection[str]) -> Problems:
-    """Yield names of sets of tracers that are not valid directory names, or are also names of variants."""
+    """Yield a problem for each set of tracers whose name is no valid directory name or is the name of a variant."""
     for name in tracers.sets:
         problem = problem_of_name(name) or name in variants and "a variant has this name; choose another"
         if problem:
@@ -158,16 +158,16 @@ def check_sets(tracers: Tracers, variants: Collection[str]) -> Problems:
 
 
 def check_reach(section: str, neighbors: float, tracers: Tracers, skin: float) -> Problems:
-    """Yield a kernel support or a radius of interaction that is, with the skin, half the cube or more."""
+    """Yield a problem if a kernel support or a radius of interaction, with the skin, is half the cube or more."""
     reach = tracers.radius_of(neighbors) * (1 + skin)
-    if reach >= math.pi:  # a particle would see another one and its image
+    if reach >= math.pi:  # a particle would interact with another one and its periodic image
         yield f"{section}.neighbors", (
             f"with {tracers.particles} particles the radius and skin are {reach:.3g}, half the cube is {math.pi:.3g}; "
             "lower neighbors or raise [tracers] particles_per_side")
 
 
 def check_needs(present: Collection[str], needs_model: bool, has_weights: bool) -> Problems:
-    """Yield sections that need a section which is missing."""
+    """Yield a problem for each section that needs another one which is missing."""
     needs = {"kernel": "tracers", "reconstruction": "tracers", "model": "tracers", "training": "model",
              "simulation": "model" if needs_model else "tracers"}
     for name, other in needs.items():
@@ -179,7 +179,7 @@ def check_needs(present: Collection[str], needs_model: bool, has_weights: bool) 
 
 
 def check_density(flow: Flow, model: Model | None, simulation: Simulation | None) -> Problems:
-    """Yield a density that is given twice, given but not read, or read but not given by the terms or the flow."""
+    """Yield a problem if the density is given twice, given but not read, or read but not given by terms or the flow."""
     incompressible, rates = not flow.compressible, {"density", "density_rate"}
     remedy = 'or set [flow] fluid = "compressible" and sound_speed'
     settings = model.settings if model else {}
@@ -211,7 +211,7 @@ def check_density(flow: Flow, model: Model | None, simulation: Simulation | None
 
 
 def check_training(training: Training, tracers: Tracers | None, kernel: Kernel | None) -> Problems:
-    """Yield steps, learning rates, frames and weights that contradict each other."""
+    """Yield a problem if steps, learning rates, frames or weights contradict each other."""
     if training.combined_steps > training.steps:
         yield "training.combined_steps", (f"must be at most steps = {training.steps}, because the combined steps are "
                                           "the last of all steps; lower it")
@@ -243,7 +243,7 @@ def check_training(training: Training, tracers: Tracers | None, kernel: Kernel |
 
 
 def check_simulation(simulation: Simulation, tracers: Tracers, seen: float) -> Problems:
-    """Yield a frame interval that is no multiple of the step or of the tracers' frame interval, and a missing start.
+    """Yield a problem if the frame interval is no multiple of the step or the tracers' interval, or start is missing.
 
     `seen` is the fraction of the ground truth that training has used.
     """
@@ -262,9 +262,9 @@ def check_simulation(simulation: Simulation, tracers: Tracers, seen: float) -> P
 
 
 def check_coarse_grid(eulerian: Eulerian | None, cells: int, flow: Flow, model: Model | None) -> Problems:
-    """Yield problems of a coarse grid: not used, finer than the flow, without sound speed, or without damping rates.
+    """Yield a problem if a coarse grid is not used, is finer than the flow, or lacks a sound speed or damping rates.
 
-    `cells` is the number of its cells along a side, 0 without a coarse grid.
+    `cells` is the number of its cells along a side, 0 if the rollout uses no coarse grid.
     """
     if eulerian is None:
         eulerian = Eulerian()

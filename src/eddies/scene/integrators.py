@@ -8,18 +8,19 @@ MOST_COURANT = 1.4
 
 @dataclass(frozen=True, kw_only=True)
 class Scheme:
-    """A scheme that a scene can name.
+    """A time stepping scheme that a scene can name.
 
-    `nodes` and `weights` are c and b of a Runge-Kutta scheme whose stages all advance from the beginning of the step,
-    each with the rates of the stage before. They are empty for others. `angle`, `iterations`: see docs/closure.md.
+    `nodes` and `weights` are the coefficients c and b of a Runge-Kutta scheme; other schemes have none. Each stage
+    starts at the beginning of the step and uses the rates of the stage before. For `angle` and `iterations` see
+    docs/closure.md.
     """
 
     name: str
-    evaluations: int  # of the rates in a step
+    evaluations: int  # number of evaluations of the rates in a step
     dense: bool = True  # whether it can interpolate between steps; otherwise frames lie at the ends of steps
     angle: float  # largest k_c u' dt at which a velocity resolved up to k_c follows the flow
     decay: float  # largest stable product of relaxation rate and time step
-    iterations: float  # of the solve for a resolved velocity, per evaluation, at about the longest step
+    iterations: float  # of the solve for the resolved velocity in an evaluation, with about the longest step
     nodes: tuple[float, ...] = ()
     weights: tuple[float, ...] = ()
 

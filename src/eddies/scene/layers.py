@@ -24,7 +24,7 @@ VARIANT = "variant"
 FILE_ONLY_KEYS = ("base", "unset")  # keys that only a file may have
 FILE_KEYS = {"initial": ("path",), "tracks": ("path",), "model": ("path",), "training": ("truths",),
              "simulation": ("step_from", "confirmed_on")}
-DEEPEST = 3  # most parts of a dotted key, section.sub.key; two more in [variant.NAME]
+DEEPEST = 3  # largest number of parts of a key, as in section.sub.key; [variant.NAME] adds two
 
 Document = dict[str, Any]
 
@@ -89,7 +89,7 @@ class Layer:
 
 
 def dotted(table: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield all values of nested tables by dotted key; an empty table counts as a value."""
+    """Yield a pair of dotted key and value for each value in nested tables; an empty table counts as a value."""
     for name, value in table.items():
         key = f"{within}.{name}" if within else name
         if isinstance(value, dict) and value:
@@ -104,10 +104,10 @@ def with_sections(key: str) -> Iterator[str]:
 
 
 def read_document(name_or_path: str, above: Sequence[Path] = ()) -> tuple[Path, Document]:
-    """Return the file of a scene, and its document merged over its bases. `above`: the files based on this scene.
+    """Return the path of a scene's file, and its document merged over the documents of its bases.
 
-    Variants of a scene replace those of its base. Raises SceneError if there is no such scene, a file is not TOML, or a
-    scene is its own base.
+    `above` holds the files of the scenes that have this one as a base. Variants of a scene replace those of its base.
+    Raises SceneError if there is no such scene, a file is not TOML, or a scene is its own base.
     """
     path = _find(name_or_path, above[-1].parent if above else None)
     try:
@@ -136,7 +136,7 @@ def read_document(name_or_path: str, above: Sequence[Path] = ()) -> tuple[Path, 
 
 
 def _find(name_or_path: str, beside: Path | None) -> Path:
-    """The file of a built-in scene, or of a path relative to the folder `beside` or else to the working directory."""
+    """Return the file of a built-in scene, or of a path from the folder `beside` or else the working directory."""
     names = sorted(path.stem for path in BUILT_IN.glob("*.toml"))
     if name_or_path in names:
         return BUILT_IN / f"{name_or_path}.toml"
@@ -155,7 +155,7 @@ def _find(name_or_path: str, beside: Path | None) -> Path:
 
 
 def _find_files(document: Document, folder: Path) -> None:
-    """Replace the relative paths of files that exist beside the scene but not in the working directory."""
+    """Make relative paths absolute if their files exist beside the scene but not in the working directory."""
     def found(path: str) -> str:
         beside = os.path.abspath(folder / path)
         return beside if not os.path.exists(path) and os.path.exists(beside) else path

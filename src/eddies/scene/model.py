@@ -12,7 +12,7 @@ from eddies.scene.terms import DEFAULT_PRESET, GIVES, PRESETS, READS, TERMS, Ter
 from eddies.scene.values import (SceneError, Section, choice, import_paths, number, product_file, read_section,
                                  sections, text, texts)
 
-BUILT_IN_PREFIX = "eddies:"  # the beginning of [model] path for weights of the package
+BUILT_IN_PREFIX = "eddies:"  # a [model] path that begins so names weights of the package
 WEIGHTS = Path(__file__).parents[1] / "weights"
 
 
@@ -25,8 +25,8 @@ def built_in_weights() -> list[str]:
 class Model(Section):
     """The terms whose sum moves the particles, each with its settings; a preset is a named list of terms.
 
-    When the section is made, the preset gives `terms` and the absent keys of their `settings`, and `preset` is set to
-    None. A program gives settings as objects or as dicts.
+    When the section is made, the preset gives `terms` and the absent keys of `settings`. Then `preset` becomes None. A
+    program gives the settings of each term as an object or as a dict.
     """
 
     preset: str | None = choice(f"name of a predefined list of terms; absent: {DEFAULT_PRESET}, unless terms is given",
@@ -86,7 +86,7 @@ class Model(Section):
 
     @property
     def damping(self) -> str | None:
-        """The parameter "NAME.rates" of a term whose damping rates a coarse grid can use; None without such a term."""
+        """The name of the parameter with damping rates for a coarse grid, such as "damping.rates"; None without one."""
         return next((f"{name}.{one.damps_by}" for name, one in self.settings.items() if one.damps_by), None)
 
     @property
@@ -96,9 +96,10 @@ class Model(Section):
 
 
 def replace_terms(table: dict[str, Any], keys: set[str]) -> None:
-    """Keep only the list of terms that was set last in a [model] table, whether it is a preset or `terms`.
+    """Keep only the list of terms that the last layer sets in a [model] table, either `preset` or `terms`.
 
-    `keys` are the keys "section.key" that were set last. Settings of terms that are no longer listed are removed.
+    `keys` are the keys "section.key" and sections that this layer sets. Settings of terms that are no longer listed are
+    removed, unless this layer sets them.
     """
     if ("model.preset" in keys) == ("model.terms" in keys):
         return
@@ -132,7 +133,7 @@ def settings_class(term: str) -> type[TermSettings]:
 
 def _settings(term: str, name: str, preset: Mapping[str, Any],
               given: TermSettings | Mapping[str, Any]) -> TermSettings:
-    """The settings of a term: the given object, or the preset with the given keys."""
+    """Return the settings of a term: the given object, or one made from the preset and the given keys."""
     try:
         kind = settings_class(term)
     except (ImportPathError, SceneError) as error:

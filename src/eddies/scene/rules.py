@@ -1,4 +1,4 @@
-"""The rule of one key: its meaning and its allowed values. Also the form of values in errors and files."""
+"""The rule of a key: its meaning and its allowed values. Also functions that write values in errors and files."""
 
 import dataclasses
 import difflib
@@ -11,9 +11,10 @@ from dataclasses import dataclass
 from typing import Any
 
 IMPORT_PATH = 'the import path "module:name" of your own'
-# Bounds of numbers and of whole numbers: beyond them squares and cubes overflow, or a run does not end.
+# Smallest and largest magnitude of a real number, and largest whole number. Beyond them squares and cubes overflow, or
+# a run does not end.
 SMALLEST, LARGEST, MOST = 1e-15, 1e15, 10**9
-# Most characters of a value in an error; most bits of a whole number that is written in decimal.
+# Largest number of characters of a value in an error, and of bits of a whole number that is written in decimal.
 SHOWN, MOST_BITS = 60, 10_000
 
 
@@ -47,7 +48,8 @@ class Rule:
     kind : type of the value, or of each entry of a list: float, int, bool or str.
     about : meaning of the key in one line.
     bounds : interval of a number.
-    words : allowed strings; a number key allows them besides numbers. A string key without words allows any string.
+    words : allowed strings. If `kind` is a number, they are allowed besides numbers. If `kind` is str and there are no
+        words, any string is allowed.
     paths : whether the import path "module:name" of a user's own class is allowed too.
     many : whether the value is a list, held as a tuple.
     """

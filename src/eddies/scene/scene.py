@@ -1,7 +1,6 @@
 """A scene: the description of a flow, and of the models to learn from it, as read from one TOML file.
 
-An optional section that is absent is None. Variants of a scene are scenes that
-differ from it in some keys.
+An optional section that is absent is None. Variants of a scene are scenes that differ from it in some keys.
 """
 
 import copy
@@ -38,8 +37,8 @@ FOREIGN_IN = ("flow", "initial", "model", "simulation")
 class Scene(Section):
     """A whole scene. The constructor checks its values and whether its sections fit together (SceneError).
 
-    A scene with [tracks] gets the sections `flow` and `tracers` from the file with the tracks, when it is run
-    (`workflows.tracks.with_tracks`); before that they are None, and the cross-checks are left out.
+    When a scene with [tracks] is run, it gets the sections `flow` and `tracers` from the file with the tracks
+    (`workflows.tracks.with_tracks`). Before that, these sections are None, and the cross-checks are left out.
 
     `variant` maps the names of the variants to their scenes, which are complete and have no variants of their own.
     """
@@ -88,7 +87,7 @@ class Scene(Section):
     def realisation(self, seed: int) -> "Scene":
         """The scene with another seed.
 
-        An initial flow of kind file is then read from realisation-SEED/NAME in the directory of its file NAME.
+        If an initial flow of kind file is read from FOLDER/NAME, the new scene reads FOLDER/realisation-SEED/NAME.
         """
         start = self.initial
         if start.flow.from_file and start.file is not None:
@@ -114,7 +113,7 @@ class Scene(Section):
 
     @property
     def tracer_sets(self) -> "dict[str, Scene]":
-        """The scenes of the ground truths of the sets of tracers, by name of the set."""
+        """For each set of tracers, by its name, the scene that makes only the ground truth of this set."""
         return {name: replace(self.ground_truth_alone, tracers=own) for name, own in self.sets.items()}
 
     # ---- values that follow from several sections
@@ -123,7 +122,7 @@ class Scene(Section):
     def stages(self) -> tuple[str, ...]:
         """The stages that this scene asks for, in the order in which they run.
 
-        With several sets of tracers these are only "dns" and "report": the others need a scene that chooses a set.
+        A scene with sets of tracers has only "dns" and "report", because the other stages need one chosen set.
         """
         if self.sets:
             return "dns", "report"
@@ -171,7 +170,7 @@ class Scene(Section):
         return self.training.window if self.training else DEFAULT_WINDOW
 
     def seen_in(self, directory: Path) -> float:
-        """Fraction of the ground truth of a run directory that the model is trained on.
+        """Fraction of the ground truth in a run directory that training uses.
 
         It is 0 without [training], and if [training] truths names only other ground truths.
         """
@@ -189,7 +188,7 @@ class Scene(Section):
 
     @property
     def needs_resolved_velocity(self) -> bool:
-        """Whether a grid resolves the velocity for the model: its terms read that velocity, or particles are forced."""
+        """Whether a grid resolves the velocity, because terms of the model read it or because particles are forced."""
         return bool(self.model and "resolved" in self.model.reads or self.tracers and self.tracers.forced
                     or self.rollout_is_forced)
 
@@ -237,7 +236,7 @@ class Scene(Section):
             check_variant(name, self.variant, self.name)
 
     def check_stages(self, stages: Sequence[str]) -> None:
-        """Raise SceneError if the section of a stage is missing."""
+        """Raise SceneError for a stage that this scene does not ask for."""
         for stage in stages:
             if stage not in self.stages:
                 if self.sets:
@@ -308,7 +307,7 @@ class Scene(Section):
                     yield f"{key_name(last, within)} = {quoted(ours)} where the scene has {quoted(theirs)}: {reason}"
 
     def _key_with_value(self, key: str) -> str:
-        """Return the beginning of an error, a key with its value if it has one, such as "[flow] cells = 8"."""
+        """Return the beginning of an error: the key, with its value if there is one, such as "[flow] cells = 8"."""
         within, _, name = key.rpartition(".")
         value: Any = self
         for part in key.split("."):
@@ -326,7 +325,7 @@ class Scene(Section):
     def to_toml(self, all_keys: bool = False) -> str:
         """Return the scene as a TOML text with a comment on every key, and the changed keys of each variant.
 
-        Reading it back gives an equal scene. With `all_keys` comments list the absent keys and sections too.
+        Reading it back gives an equal scene. If `all_keys` is true, comments list the absent keys and sections too.
         """
         lines = write_section(self, all_keys=all_keys)
         for name in self.variant:
@@ -376,7 +375,7 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = (), removals
 
 
 def _tables_of_variants(document: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """The changed keys of each variant of a document; SceneError where [variant] is not a section of sections."""
+    """Return the changed keys of each variant. Raises SceneError if [variant] is not a section of sections."""
     tables = document.get(VARIANT, {})
     if not isinstance(tables, dict) or not all(isinstance(table, dict) for table in tables.values()):
         raise SceneError(f"{VARIANT}: must be sections; write [{VARIANT}.NAME] and the changed keys below", VARIANT)

@@ -22,9 +22,9 @@ from eddies.scene.values import (KeyProblem, SceneError, Section, boolean, choic
 
 BOX_LENGTH = 2 * math.pi
 DEFAULT_WINDOW = 0.5
-# Most cells along a side of the cube: twice as many as in the largest direct simulations.
+# Largest number of cells along a side of the cube: twice that of the largest direct simulations.
 MOST_CELLS = 65536
-# Default mean number of particles within a support or a radius of interaction, as in the paper.
+# Default mean number of particles within the kernel support or the radius of interaction, as in the paper.
 NEIGHBORS = 60.0
 
 
@@ -40,7 +40,7 @@ class Flow(Section):
 
     @property
     def compressible(self) -> bool:
-        """Whether the fluid has a density, and sound."""
+        """Whether the fluid has a variable density and sound waves."""
         return load(self.fluid).compressible if is_path(self.fluid) else self.fluid == "compressible"
 
     @property
@@ -63,7 +63,7 @@ class Flow(Section):
 class InitialFlow:
     """Properties of an initial flow that are known before it is made."""
 
-    keys: tuple[str, ...] = ("amplitude", "peak_wavenumber", "wavenumber", "path", "state")  # keys that it reads
+    keys: tuple[str, ...] = ("amplitude", "peak_wavenumber", "wavenumber", "path", "state")  # its keys in [initial]
     rms: float | None = None  # root mean square of |u|, divided by the amplitude; None: unknown, or at rest
     peak: float | None = None  # largest |u| + |v| + |w|, divided by the amplitude; None: unknown, or at rest
     turbulent: bool = False  # it has many scales, with the spectrum's peak at `peak_wavenumber`
@@ -119,9 +119,9 @@ class Initial(Section):
 class Tracks(Section):
     """Measured particle tracks, used in place of the direct simulation and its tracers.
 
-    Lengths are in the unit of the file, and times in the time unit of its velocities. In the run the edge of the box is
-    2 pi, and times keep this unit. Fields are made from all tracks of a frame; models use only the tracks that are
-    present in all frames.
+    In this section lengths are in the length unit of the file, and times in the time unit of its velocities. A run has
+    the same unit of time, but its box has the edge 2 pi. Fields are made from all tracks of a frame; models use only
+    the tracks that are present in all frames.
     """
 
     path: str = text("file with the tracks")
@@ -205,8 +205,8 @@ class Tracers(Section):
     """Particles that follow the filtered flow: the ground truth for learning.
 
     An absent `filter_width` gets its value when the section is made. `sets` holds the sets that one simulation carries,
-    by NAME of [tracers.NAME]; a set takes the keys that it lacks from [tracers]. If `set` chooses one of them, the
-    section takes its values, and `sets` is empty.
+    by NAME of [tracers.NAME]. A set takes the keys that it lacks from [tracers]. If `set` names one of the sets, the
+    section takes the values of this set, and `sets` becomes empty.
     """
 
     _holder: ClassVar[str] = "sets"
@@ -256,7 +256,7 @@ class Tracers(Section):
                 object.__setattr__(self, field.name, getattr(chosen, field.name))
 
     def _set_of(self, name: str, own: Any) -> Tracers:
-        """Make a set from its table or object; the keys outside SET_KEYS are those of this section."""
+        """Make a set from its table or object; its keys outside SET_KEYS get the values of this section."""
         if isinstance(own, Tracers):
             return dataclasses.replace(self, sets={}, set=None, **{key: getattr(own, key) for key in SET_KEYS})
         if not isinstance(own, dict):
@@ -308,8 +308,8 @@ class Tracers(Section):
     def planes(self) -> int:
         """Cells along each side of the grid of the resolved velocity; the slabs of particles end at its planes.
 
-        1.75 N^(1/3) rounded to even: the shortest resolved wave has 1.5 times the particles' Nyquist
-        wavenumber and 2.3 cells, which cubic splines can follow.
+        The number is 1.75 N^(1/3), rounded to even. The highest resolved wavenumber is 1.5 times the Nyquist wavenumber
+        of the particles. Its wavelength is then 2.3 cells, which cubic splines can represent.
         """
         return 2 * round(0.875 * self._per_side)
 
@@ -469,7 +469,7 @@ METHODS = {
 }
 # Needs of a method: a trained model, the density of the ground truth, neighbours within the radius of interaction.
 NEEDS = ("model", "density", "pairs")
-#: The value of [simulation] step that short rollouts replace by the step that they find.
+#: If [simulation] step has this value, short rollouts find the step.
 CONVERGED = "converged"
 
 
@@ -571,7 +571,7 @@ class Closure:
 
     equations: tuple[str, ...]  # equations that it closes
     constant: str | None = None  # key of [eulerian] with its constant
-    learned: bool = False  # it takes the rates of damping that a model has learned
+    learned: bool = False  # it uses the damping rates that a model has learned
 
 
 EQUATIONS = ("unfiltered", "filtered")
@@ -617,11 +617,11 @@ class Eulerian(Section):
 
     @property
     def compressible(self) -> bool:
-        """Whether the fluid has a density, and sound."""
+        """Whether the fluid has a variable density and sound waves."""
         return self.fluid == "compressible"
 
     def filter_passed(self, filter_width: float) -> float:
-        """Filter width of the velocity in the equations: that of the particles, or 0 for the unfiltered velocity."""
+        """Filter width of the velocity in the equations: the given one, or 0 if the equations are unfiltered."""
         return filter_width if self.equations == "filtered" else 0.0
 
     def cells_for(self, filter_width: float) -> int:

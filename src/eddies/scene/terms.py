@@ -16,13 +16,14 @@ from eddies.scene.values import Section, boolean, choice, integer, integers, nam
 
 READS = ("pairs", "resolved", "density")
 GIVES = ("acceleration", "density", "density_rate", "shift_velocity")
-#: The inputs of a pair network, in units of the flow: the densities of both particles, |x|, |v| and x.v.
+#: The inputs of a pair network, in units of the flow: the densities of both particles, and |x|, |v| and x.v of their
+#: separation x and their relative velocity v.
 INPUTS = ("density", "distance", "speed", "approach")
 BASES = ("corrected", "paper", "unit")
-# The ratio of the largest rate of relaxation to the nominal rate. The estimate from neighbours contains the noise of
-# a particle with the opposite sign, so the ratio is 3.6 to 4.0 among random particles and in turbulence. Two fifths of
-# 4.0 are added for other noise: with 4.2 a flow at M_t = 0.16 diverged after a turnover, with 5.5 a flow on 256^3
-# cells after a few steps.
+# The ratio of the largest rate of relaxation to the nominal rate. The noise of a particle enters the estimate from its
+# neighbours with the opposite sign. So the ratio is 3.6 to 4.0, both among random particles and in turbulence. Two
+# fifths of 4.0 are added for other noise: with a ratio of 4.2 a flow at M_t = 0.16 diverged after a turnover, and with
+# 5.5 a flow on 256^3 cells diverged after a few steps.
 NOISE_AMONG_NEIGHBORS = 5.6
 
 
@@ -43,7 +44,7 @@ class TermError(UserError, ValueError):
 
 
 class TermBase:
-    """Base of eddies.Term, by which the class of a term is recognised without importing torch."""
+    """Base class of eddies.Term. It serves to recognise the class of a term without importing torch."""
 
     Settings: type["TermSettings"]
 
@@ -55,12 +56,12 @@ class TermSettings(Section):
     Attributes
     ----------
     word : name of the term in scenes; empty for a user's class.
-    reads : any of "pairs" (neighbours within the interaction radius, also for kriging), "resolved" (the velocity on a
-        grid) and "density" (computed, stored, and needed in the ground truth). The term gets only what is listed.
-    gives : any of "acceleration", "density" (a contribution to it), "density_rate" and "shift_velocity".
-    learns_through_horizons : only training through several steps of the simulation fits its parameters.
-    viscous : it needs the viscosity of the fluid.
-    damps_by : its parameter with damping rates by wavenumber, which a coarse grid can use; empty: it has none.
+    reads : its inputs, any of "pairs" (neighbours within the interaction radius, also for kriging), "resolved" (the
+        velocity on a grid) and "density" (computed, stored, and needed in the ground truth). It gets no others.
+    gives : its outputs, any of "acceleration", "density" (a contribution to it), "density_rate" and "shift_velocity".
+    learns_through_horizons : whether only training through several steps of the simulation fits its parameters.
+    viscous : whether it needs the viscosity of the fluid.
+    damps_by : name of its parameter with damping rates by wavenumber, which a coarse grid can use; empty without one.
     too_long : text of the error for a step beyond `longest_step`; it may contain {name}, {longest} and {integrator}.
     """
 
@@ -312,18 +313,22 @@ class FilteredEquations(TermSettings):
         return units.scheme.decay / rate
 
 
-#: The terms that a scene can name: the classes above with a word.
+#: The terms that a scene can name, by their word: all classes above that have a word.
 TERMS: dict[str, type[TermSettings]] = {kind.word: kind for kind in list(globals().values())
                                         if isinstance(kind, type) and issubclass(kind, TermSettings) and kind.word}
 
-# Values near those that training finds. With the usual ones friction is tens of times the accelerations of turbulence.
+# Values near those that training finds. With the usual values the friction is tens of times as large as the
+# accelerations of turbulence.
 LITTLE_FRICTION = {"alpha": 0.05, "beta": 1.5}
 
 RESOLVED = ("pressure", "stress", "viscosity", "damping", "relaxation")
 
 
 def _published(basis: str, hidden: tuple[int, ...]) -> dict[str, Mapping[str, Any]]:
-    """Eq. 3: networks of force and density, and Pi in both equations. What the paper omits is as in its public code."""
+    """Return the terms of Eq. 3 with their settings: networks of force and density, and Pi in both equations.
+
+    Settings that the paper does not state are those of its public code.
+    """
     plain, network = {"window": "none", "scaling": "root"}, {"hidden": hidden}
     return {"pairs": {"basis": basis, **plain, **network},
             "eddy-viscosity": {"basis": basis, "form": "bounded", **plain},
@@ -335,8 +340,8 @@ PRESETS: dict[str, dict[str, Mapping[str, Any]]] = {
     "paper": _published("paper", (20, 20, 20, 20)),
     "paper-code": _published("unit", (20, 100, 20)),
     "resolved": dict.fromkeys(RESOLVED, {}),
-    # The density follows from the pressure, whose force is already a term. As an input of the network it adds nothing,
-    # and doubles the cost, because the forces of a pair are no longer opposite.
+    # The density follows from the pressure, whose force is already a term. So the density as an input of the network
+    # adds nothing. It also doubles the cost, because the forces of a pair are then not opposite.
     "resolved + pairs": {**dict.fromkeys(RESOLVED, {}), "pairs": {"inputs": ("distance", "speed", "approach")}},
     "local": {"filtered-equations": {}, "eddy-viscosity": {}},
     "wcsph": {"continuity": {}, "wcsph": LITTLE_FRICTION},

@@ -1,8 +1,8 @@
 """Sections of a scene: frozen dataclasses whose fields declare their keys.
 
 A field declares its key by a function (`number`, `numbers`, `integer`, `integers`, `boolean`, `choice`, `named`, `text`
-or `texts`): the meaning, the allowed values and the default. Errors, written scenes, the reference page and the JSON
-schema use this one declaration. It applies to objects made in a program and to those read from a TOML file.
+or `texts`), which takes the meaning, the allowed values and the default. Errors, written scenes, the reference page and
+the JSON schema use this one declaration. It applies to objects made in a program and to those read from a TOML file.
 """
 
 import dataclasses
@@ -127,7 +127,7 @@ def text(about: str, default: Any = MISSING) -> Any:
 
 
 def texts(about: str, *words: str, default: Any = MISSING, paths: bool = False) -> Any:
-    """Declare a dataclass field that holds a tuple of strings: any strings without `words`, else only `words`.
+    """Declare a dataclass field that holds a tuple of strings: only `words` or, if none are given, any strings.
 
     With `paths` import paths are allowed too.
     """
@@ -140,7 +140,7 @@ def section(kind: type, default: Any = MISSING) -> Any:
 
 
 def sections() -> Any:
-    """Declare a dataclass field that holds a dict of sections, which its class checks itself."""
+    """Declare a dataclass field that holds a dict of sections. The class with this field checks them itself."""
     return dataclasses.field(default_factory=dict, metadata={"section": None})
 
 
@@ -211,8 +211,8 @@ def _missing_key(kind: type[Section], field: dataclasses.Field, section: str) ->
 def write_section(section: Section, name: str = "", all_keys: bool = False) -> list[str]:
     """Return the lines `key = value  # meaning` of a section and of its own sections.
 
-    Absent keys and sections, and sections without keys, are left out. With `all_keys` comments list them. An inner
-    section does not repeat lines of the outer section.
+    Absent keys and sections, and sections without keys, are left out. If `all_keys` is true, comments list what is
+    absent. An inner section does not repeat lines of the outer section.
     """
     lines, inner = [], []
     for field in dataclasses.fields(section):
@@ -230,7 +230,7 @@ def write_section(section: Section, name: str = "", all_keys: bool = False) -> l
             for key, part in value.items():
                 written = [line for line in write_section(part, all_keys=all_keys) if line not in lines]
                 same = isinstance(part, type(section))
-                if same:  # an inner section without a key takes it from the outer one
+                if same:  # write absent keys, or the outer section would give them
                     written += [f'{each.name} = "{ABSENT}"' for each in dataclasses.fields(part)
                                 if getattr(part, each.name) is None and getattr(section, each.name) is not None]
                 if written or same:
@@ -275,7 +275,7 @@ def product_file(path: str, stage: str) -> Path:
 
 
 def key_name(key: str, section: str) -> str:
-    """Return the name of a key in errors."""
+    """Return the name of a key in errors: "[section] key", or the key alone if it is in no section."""
     return f"[{section}] {key}" if section else key
 
 

@@ -1,7 +1,8 @@
 """One-dimensional passes of a slab transform, in blocks that fit the cache, on the kept modes only.
 
-Real fields are transformed two planes at a time, f + i g as one complex plane: FFTW's complex transforms run at full
-vector width. Its real ones took 2.5 times as long at 128^2 with measured plans, 5 times with estimated ones.
+Two planes f and g of a real field are transformed together as one complex plane f + i g, because FFTW's complex
+transforms run at full vector width. Its real transforms took 2.5 times as long at 128^2 with measured plans, and 5
+times as long with estimated plans.
 
 All plans use FFTW_ESTIMATE: measured plans may differ from run to run, and with them the last bits of the results.
 """
@@ -20,10 +21,10 @@ from eddies.kernels.library import library
 BLOCK_BYTES = 2**18  # size of a block per component and thread: a few blocks fit the second-level cache of a core
 CACHE_LINE = 64
 # Numbers that are a multiple of this many bytes apart share few sets of a cache and evict each other. A transform of 48
-# such numbers takes twelve times as long, one of 192 four times.
+# such numbers takes twelve times as long as usual, and one of 192 four times as long.
 CROWDED = 512
 
-#: Packed modes (c, pairs, ky, kx), or a factor (1, 1, ky, 1) or (1, 1, 1, kx) and the modes that it multiplies.
+#: Packed modes (c, pairs, ky, kx), or a tuple: a factor (1, 1, ky, 1) or (1, 1, 1, kx), and the modes to multiply.
 Part = np.ndarray | tuple[np.ndarray, np.ndarray]
 
 
@@ -36,7 +37,7 @@ class ColumnPlan(NamedTuple):
 
 
 class ColumnPass:
-    """Transforms along z of columns (z, y, x) of one component, `cells` long, with cutoff + 1 modes along x."""
+    """Transforms of one component along z. Columns (z, y, x) have `cells` points in z and cutoff + 1 modes along x."""
 
     def __init__(self, cells: int, cutoff: int, dtype: np.dtype) -> None:
         self.cells, self.width, self.dtype = cells, cutoff + 1, np.dtype(dtype)
@@ -67,10 +68,10 @@ class ColumnPass:
 class PlanePlans(NamedTuple):
     """Plans for pairs of planes, and their memory.
 
-    `rows` (pairs, y, kx) is transformed along y and serves one field after the other. Its dropped modes stay zero,
-    because no plan writes to its input. `planes` holds the complex planes (pairs, y, x) of each field. Both have the
-    form that `PlanePass.copies` takes. `values` (fields, pairs, y, 2 x) are the same planes as real numbers, with the
-    two values of a point side by side.
+    `rows` (pairs, y, kx) is transformed along y; all fields use it, one after the other. Its dropped modes stay zero,
+    because no plan writes to its input. `planes` holds the complex planes (pairs, y, x) of each field. `rows` and
+    `planes` have the form that `PlanePass.copies` takes. `values` (fields, pairs, y, 2 x) are the same planes as real
+    numbers, with the two values of a point side by side. `plans` holds the plans of each field in their order.
     """
 
     rows: Any
@@ -91,13 +92,13 @@ class PlanePass:
         self._plans: dict[tuple[str, int, int], PlanePlans] = {}
 
     def blocks(self, count: int) -> list[slice]:
-        """Divide `count` planes into blocks transformed together: of an even number, and an odd last plane alone."""
+        """Divide `count` planes into blocks transformed together: an even number of planes, or one last plane."""
         size, even = 2 * max(1, threads() * BLOCK_BYTES // (self.cells**2 * self.dtype.itemsize)), count - count % 2
         blocks = [slice(start, min(start + size, even)) for start in range(0, even, size)]
         return blocks if even == count else [*blocks, slice(even, count)]
 
     def to_physical(self, packed: Sequence[Part], fields: int, planes: slice) -> PlanePlans:
-        """Transform the packed modes of `fields` fields, given in parts, to a block of planes."""
+        """Transform packed modes of `fields` fields, in parts, to a block of planes; return plans that hold it."""
         plans = self.plans("BACKWARD", fields, planes)
         parts = (part if isinstance(part, tuple) else (None, part) for part in packed)
         filled = itertools.chain.from_iterable(self.copies.filled(part, factors, plans.rows) for factors, part in parts)
@@ -107,8 +108,11 @@ class PlanePass:
         return plans
 
     def to_modes(self, plans: PlanePlans, blocks: Any, component: int, planes: slice) -> None:
-        """Transform planes of fields to twice their modes, not normalised, and store them as components `component`,
-        `component` + 1, ... of `blocks`, which are in the form that the copies take."""
+        """Transform planes of fields, and store twice their modes, not normalised, in `blocks`.
+
+        The first field is stored as the component with the number `component`, and the others follow. `blocks` has the
+        form that the copies take.
+        """
         for number, of_field in enumerate(plans.plans, component):
             for plan in of_field:
                 plan.execute()

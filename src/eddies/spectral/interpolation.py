@@ -38,11 +38,11 @@ class SplineInterpolation:
         self.inverse = (1.0 / (transforms[0] * transforms[1] * transforms[2])).astype(grid.real)
 
     def coefficients(self, spectral: np.ndarray) -> list[np.ndarray]:
-        """Return the spline coefficients of fields with modes (c, kz, ky, kx), as parts for `at`."""
+        """Return the spline coefficients of fields with modes (c, kz, ky, kx), in the parts that `at` takes."""
         return self.with_ghosts(self.grid.backward(spectral * self.inverse))
 
     def with_ghosts(self, planes: np.ndarray) -> list[np.ndarray]:
-        """Return planes (c, z_local, y, x) of coefficients with the ghost planes of the neighbours, as parts."""
+        """Return coefficients (c, z_local, y, x) in three parts: ghost planes below, own planes, ghost planes above."""
         return self._halo.forward(planes)
 
     def at(self, coefficients: Sequence[np.ndarray], positions: np.ndarray) -> np.ndarray:
@@ -52,8 +52,8 @@ class SplineInterpolation:
     def around(self, positions: np.ndarray) -> Splines:
         """Return the splines around positions (n, 3), for several uses at the same points.
 
-        x and y may be anywhere. z, up to whole periods, must be in the slab or the margin. Raises HaloError if it is
-        not, and ValueError if a position is not finite.
+        x and y may be anywhere. z, up to whole periods, may be outside the slab by at most the margin. Raises HaloError
+        if z is farther outside, and ValueError if a position is not finite.
         """
         try:
             return Splines(library(), self.degree, positions, self._padded)
@@ -65,7 +65,7 @@ class SplineInterpolation:
                         "lower step, courant or max_step")
 
     def spread(self, values: np.ndarray, splines: Splines) -> np.ndarray:
-        """Return planes (c, z_local, y, x) of the sum of splines times values (n, c).
+        """Return the sum over the points of their values (n, c) times their splines, on planes (c, z_local, y, x).
 
         This is the transpose of `with_ghosts` followed by evaluation at the points.
         """
@@ -75,7 +75,7 @@ class SplineInterpolation:
 
 
 def _spline_transform(degree: int, angle: np.ndarray) -> np.ndarray:
-    """Return the discrete Fourier transform of the cubic or quintic B-spline at integers."""
+    """Return the discrete Fourier transform, at k dx = `angle`, of the cubic or quintic B-spline at integers."""
     if degree == 3:
         return (2 + np.cos(angle)) / 3
     return (33 + 26 * np.cos(angle) + np.cos(2 * angle)) / 60

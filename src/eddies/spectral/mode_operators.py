@@ -1,6 +1,7 @@
 """Operators on the modes of fields, for numpy arrays and torch tensors; autograd differentiates them on tensors.
 
-Modes are (..., kz, ky, kx). Vectors have the order x, y, z, symmetric matrices xx, yy, zz, xy, xz, yz.
+Modes are (..., kz, ky, kx). The components of vectors have the order x, y, z, and those of symmetric matrices the
+order xx, yy, zz, xy, xz, yz.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,7 +14,7 @@ Modes = Any
 
 
 class ModeOperators:
-    """Derivatives and projections of the modes of given wavevectors.
+    """Derivatives and projections of modes with given wavevectors.
 
     Parameters
     ----------
@@ -26,7 +27,7 @@ class ModeOperators:
                  stack: Callable[[Sequence[Modes]], Modes]) -> None:
         self.wavevector, self.wavenumber_squared, self._stack = tuple(wavevector), wavenumber_squared, stack
         mean = wavenumber_squared == 0
-        #: 1/k^2, 0 for k = 0
+        #: 1/k^2, but 0 for k = 0
         self.inverse_squared = (1 / (wavenumber_squared + mean)) * ~mean
 
     def along_wavevector(self, vector: Modes) -> Modes:
@@ -53,7 +54,7 @@ class ModeOperators:
         return self._stack([self.divergence(row) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))])
 
     def pressure_of(self, stress: Modes) -> Modes:
-        """Return p (kz, ky, kx) with mean zero and  laplacian p = -d_i d_j tau_ij  for a symmetric matrix (6, ...).
+        """Return p (kz, ky, kx) of mean zero with  laplacian p = -d_i d_j tau_ij,  for a symmetric matrix (6, ...).
 
         div tau + grad p is solenoidal. With tau = u u, p is the kinematic pressure of an incompressible flow u.
         """
@@ -66,7 +67,8 @@ class ModeOperators:
 def rising(shell: Modes, highest: float, values: Modes) -> Modes:
     """Return a piecewise linear function of |k| = `shell`: a learned damping rate.
 
-    It is 0 at 0, has `values` (n,) at n wavenumbers equally spaced up to `highest`, and is constant beyond.
+    The function is 0 at |k| = 0 and has `values` (n,) at |k| = `highest` i / n, i = 1 ... n. Beyond `highest` it is
+    constant.
     """
     place, result, before = shell * (len(values) / highest), 0.0, 0.0
     for number, value in enumerate(values):
@@ -78,6 +80,6 @@ def rising(shell: Modes, highest: float, values: Modes) -> Modes:
 def gaussian_transfer(wavenumber_squared: np.ndarray | float, width: float) -> np.ndarray:
     """Return exp(-k^2 d^2 / 24), the Fourier transform of the Gaussian filter of width d.
 
-    Its second moment is that of a box filter of the same width (Pope 2000, Table 13.2).
+    The filter has the second moment of a box filter of the same width (Pope 2000, Table 13.2).
     """
     return np.exp(-np.asarray(wavenumber_squared) * width**2 / 24)

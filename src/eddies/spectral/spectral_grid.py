@@ -23,7 +23,7 @@ Expansion = Callable[[np.ndarray], Sequence[Part]]
 
 
 class _Batch(NamedTuple):
-    """Transpose of a batch of components, and its blocks in the forms that ColumnCopies and PlaneCopies take."""
+    """Transpose of a batch of components. ColumnCopies take its blocks as `columns`, PlaneCopies as `planes`."""
 
     transpose: Transpose
     columns: Any
@@ -34,7 +34,7 @@ class SpectralGrid(ModeOperators):
     """Fourier transforms on a periodic cube of `cells`^3 points, slab-decomposed, with the modes |k_i| <= cutoff.
 
     Physical arrays are (components, z_local, y, x), real. Spectral arrays are (components, kz, ky_local, kx), complex.
-    They hold kz, ky = 0 ... K, -K ... -1 and kx = 0 ... K, and the ranks share ky:
+    They hold kz, ky = 0 ... K, -K ... -1 and kx = 0 ... K, where ky is divided among the ranks:
 
         f(x) = sum over k of f_hat(k) exp(i k.x),      f_hat(k) = mean over x of f(x) exp(-i k.x).
 
@@ -45,7 +45,7 @@ class SpectralGrid(ModeOperators):
     cutoff : largest wavenumber K of each direction, in units of 2 pi / length, at most (cells - 1) // 2. The default,
         the largest integer below cells / 3, makes quadratic products free of aliasing (Orszag 1971).
 
-    Dropped modes are neither transformed further nor sent.
+    Modes beyond the cutoff are neither transformed further nor sent.
     """
 
     def __init__(self, decomposition: SlabDecomposition, precision: str = "float64", cutoff: int | None = None) -> None:
@@ -69,7 +69,7 @@ class SpectralGrid(ModeOperators):
         #: i kx and i ky of all modes in (ky, kx), in storage order, for the `expand` of `blocks`
         self.d_dx = (1j * unit * signed).astype(self.complex)[None, None, None, :]
         self.d_dy = (1j * unit * signed).astype(self.complex)[None, None, :, None]
-        #: number of times a stored mode occurs in the full sum: 2, but 1 for kx = 0, whose mirror images are stored
+        #: weight of a stored mode in a sum over all modes: 2, but 1 for kx = 0, where the mode -k is stored, too
         self.multiplicity = np.where(self.index[0] == 0, 1, 2).astype(self.real)
         #: shape (z_local, y, x) of one component in physical space on this rank
         self.physical_shape = (decomposition.count, self.cells, self.cells)
@@ -113,8 +113,8 @@ class SpectralGrid(ModeOperators):
                  **fields: Any) -> np.ndarray:
         """Return the modes (results, kz, ky_local, kx) of products of fields, formed at the grid points.
 
-        `product(values, out)` gets the values (fields, pairs, y, 2 x) of the fields that `blocks` yields for the same
-        arguments, and fills `out` (results, pairs, y, 2 x).
+        The fields are those of `blocks(spectral, **fields)`. `product(values, out)` gets their values (fields, pairs,
+        y, 2 x) and fills `out` (results, pairs, y, 2 x).
         """
         blocks = self._batch("forward", results).planes
         for planes, values in self._value_blocks(spectral, **fields):
@@ -124,7 +124,7 @@ class SpectralGrid(ModeOperators):
         return self._planes_to_columns(results)
 
     def squares(self, vector: np.ndarray) -> np.ndarray:
-        """Return the modes (6, kz, ky_local, kx) of u_i u_j, ij = xx, yy, zz, xy, xz, yz, of a vector's modes."""
+        """Return the modes (6, kz, ky_local, kx) of u_i u_j, ij = xx, yy, zz, xy, xz, yz, from the modes of u."""
         def product(u: np.ndarray, out: np.ndarray) -> None:
             for row, (i, j) in enumerate(SYMMETRIC):
                 np.multiply(u[i], u[j], out=out[row])
@@ -135,24 +135,26 @@ class SpectralGrid(ModeOperators):
                z_derivatives: int = 0) -> Iterator[np.ndarray]:
         """Yield real fields at all grid points of this rank, a few planes at a time: values (fields, pairs, y, 2 x).
 
-        Planes come in pairs, with the two values of a point side by side; a last odd one is (fields, 1, y, x). A block
-        of planes stays in cache while it is used. The next block uses the same memory.
+        Planes come in pairs, with their two values at a point (y, x) side by side. If the number of planes is odd, the
+        last plane comes alone, as (fields, 1, y, x). A block of planes stays in cache while it is used. The next block
+        uses the same memory.
 
         Parameters
         ----------
         spectral : modes (c, kz, ky_local, kx).
         fields : number of fields yielded.
-        expand : makes the modes of the fields, in parts (c_i, pairs, ky, kx), from packed modes in (ky, kx) of pairs of
-            planes. It gets the packed modes of `spectral`, and of the z derivatives of the first `z_derivatives`
-            components. It may combine them and multiply by `d_dx` and `d_dy`. A part (d_dx, modes) is multiplied while
-            it is copied. By default the fields are the input of `expand`.
+        expand : function of packed modes (c, pairs, ky, kx), in which two planes f and g are one complex plane f + i g.
+            It gets the packed modes of `spectral`, followed by those of the z derivatives of the first `z_derivatives`
+            components. It returns the packed modes of the fields, as a list of parts (c_i, pairs, ky, kx). It may
+            combine its input and multiply it by `d_dx` and `d_dy`. A part (d_dx, modes) stands for their product, which
+            is formed while the modes are copied. By default the fields are the input of `expand`.
         """
         for planes, values in self._value_blocks(spectral, fields, expand, z_derivatives):
             yield values[..., ::2] if planes.stop - planes.start == 1 else values
 
     def _value_blocks(self, spectral: np.ndarray, fields: int, expand: Expansion | None = None,
                       z_derivatives: int = 0) -> Iterator[tuple[slice, np.ndarray]]:
-        """Yield blocks of planes and values (fields, pairs, y, 2 x); a single plane is its own partner."""
+        """Yield slices of planes and their values (fields, pairs, y, 2 x); a single plane is paired with itself."""
         for planes, packed in self._packed_blocks(spectral, z_derivatives):
             parts = [packed] if expand is None else expand(packed)
             yield planes, self.plane_pass.to_physical(parts, fields, planes).values
@@ -164,7 +166,7 @@ class SpectralGrid(ModeOperators):
             yield planes, copies.pack(blocks, planes)
 
     def _columns_to_planes(self, spectral: np.ndarray, z_derivatives: int) -> _Batch:
-        """Transform components, and z derivatives of the first `z_derivatives`, along z; redistribute all to planes."""
+        """Transform components along z, and z derivatives of the first `z_derivatives`; redistribute all to planes."""
         components, copies = len(spectral), self.column_pass.copies
         batch = self._batch("backward", components + z_derivatives)
         modes = self._described(spectral, self.complex, self.spectral_shape)
@@ -181,7 +183,7 @@ class SpectralGrid(ModeOperators):
         return batch
 
     def _described(self, array: np.ndarray, dtype: type, shape: tuple[int, ...]) -> Any:
-        """Return an array of the caller in the form that the copies take. Raises ValueError for another shape."""
+        """Return an array (c, *shape) in the form that the copies take. Raises ValueError for another shape."""
         array = np.require(array, dtype, "CW")
         require(array, (len(array), *shape), dtype)
         return self.plane_pass.copies.described(array)
@@ -201,7 +203,7 @@ class SpectralGrid(ModeOperators):
         return spectral
 
     def _batch(self, direction: str, components: int) -> _Batch:
-        """Return the memory in which a batch of components is sent, for one transform at a time in each direction."""
+        """Return the memory for sending a batch of components in a direction; one transform at a time can use it."""
         key = (direction, components)
         if key not in self._batches:
             transpose = Transpose(self.decomposition.comm, self.cells, self.modes, components, self.cutoff + 1,
@@ -226,7 +228,7 @@ def regrid(source: SpectralGrid, target: SpectralGrid, spectral: np.ndarray) -> 
     planes = [np.r_[0 : K + 1, grid.modes - K : grid.modes] for grid in (source, target)]
     sent, received = (np.abs(grid.index[1].ravel()) <= K for grid in (source, target))
     ky = source.index[1].ravel()[sent]
-    # Both grids cut the same ascending list of ky into blocks, so rows arrive in the order in which they are stored.
+    # Both grids store ky in the same order, in consecutive blocks, so rows arrive in storage order.
     position = np.where(ky >= 0, ky, ky + target.modes)
     owner = np.searchsorted(target.column_starts, position, side="right") - 1
     rows = np.moveaxis(spectral[:, planes[0]][:, :, sent, : K + 1], 2, 0)

@@ -37,7 +37,7 @@ def diff_lines(one: Path, other: Path) -> list[str]:
 
 
 def table(title: str, columns: list[dict[str, Any]], runs: tuple[Path, Path], ratio: bool = False) -> list[str]:
-    """The rows in which two columns differ, with "-" for a missing value; or one line if nothing differs."""
+    """Lines of a table of the values that differ between two runs, "-" if missing; or one line if nothing differs."""
     rows = [(title, *map(str, runs), "ratio" if ratio else "")]
     for key in dict.fromkeys([*columns[0], *columns[1]]):
         first, second = (column.get(key) for column in columns)

@@ -1,4 +1,4 @@
-"""Ground truth: direct numerical simulation, spin-up, filter, tracers."""
+"""`eddies dns`: make a ground truth by direct numerical simulation, with spin-up, filter and tracers."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, stage_fin
 
 log = logging.getLogger("eddies")
 
-# Called with a time and a largest step; raises SceneError if the time takes too many such steps.
+# Function of a time span and the largest step. It raises SceneError if the span takes too many such steps.
 SpanCheck = Callable[[float, float], None]
 
 
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
-    """Simulate the flow of a scene and write ground_truth.h5: statistics, and frames and fields with [tracers].
+    """Simulate the flow of a scene and write ground_truth.h5: statistics and, with [tracers], frames and fields.
 
     With sets of tracers, each set gets its own ground truth SET/ground_truth.h5, as if it were the only set. The ground
     truth of the run directory then has no tracers.
 
     The flow is first spun up ([spin_up]). The forcing ends at the release of the tracers, unless [tracers] forced is
-    true. The run continues from the newest checkpoint with the same settings; only its duration may differ. Without
-    sets, the last state is kept as a checkpoint. The product then holds the frames before this state.
+    true. The run continues from the newest checkpoint with the same settings; only the duration of the run may
+    differ. Without sets, the last state is kept as a checkpoint, and the product holds the frames up to this state.
 
     Raises SceneError if the checkpoint is later than the end of the run, and Stopped, after a checkpoint, if `stop`
     requests it.
@@ -173,7 +173,7 @@ def too_late(guard: Guard, key: str) -> SceneError:
 
 
 def run_for(flow: FlowRun, duration: float, check: SpanCheck) -> None:
-    """Run the flow for a time after its start or spin-up. Raises SceneError if that takes too many steps."""
+    """Run the flow for a duration after its start or spin-up. Raises SceneError if that takes too many steps."""
     clock = flow.clock
     if flow.phase == "start":
         check(duration, flow.step_limit.bound(flow.state, clock))

@@ -30,11 +30,11 @@ Series = Mapping[str, Mapping[str, Any]]  # by group ("fields" or "particles") a
 def run(run_directory: Path, output: Path, comm: Comm, layout: str = "vtkhdf") -> None:
     """Write every series of a run directory; all ranks call it.
 
-    With the layout "vtkhdf" a series is the file OUTPUT/PRODUCT-GROUP-NAME.vtkhdf, GROUP being fields or particles;
-    with "lagrangebench" a series of particles is the directory OUTPUT/PRODUCT-particles-NAME.
+    In the layout "vtkhdf" a series is the file OUTPUT/PRODUCT-GROUP-NAME.vtkhdf, where GROUP is fields or particles.
+    In the layout "lagrangebench" a series of particles is the directory OUTPUT/PRODUCT-particles-NAME.
 
     Raises:
-        ProductError: on all ranks; there is no such series, a product is damaged, or a file cannot be written.
+        ProductError: there is nothing to write, a product is damaged, or a file cannot be written; on all ranks.
     """
     alone = comm.Split(comm.rank)
     try:

@@ -1,15 +1,16 @@
-"""Find the cheapest time step of a rollout that has converged, by short rollouts on the ground truth.
+"""Find the cheapest converged time step of a rollout, by short rollouts on the ground truth.
 
-The rule is the same for every method. The steps of an integrator differ by factors of two. A step is compared with half
-of it: the difference d of the final velocities (rms) is taken as the error that the step adds to the error e of the
-rollout. Independent errors add as squares. The step has converged if e^2 + d^2 is below (1.02 e)^2, which allows d to
-be a fifth of e, or if d is less than 1e-3 of the velocity. A step must also converge on all ground truths in
-[simulation] confirmed_on. For coarse grids the step is a Courant number. The cheapest converged step is stored.
+The rule is the same for every method. The steps of an integrator differ by factors of two. Each step is compared with
+half of it: d is the rms difference of the final velocities, and e is the error of the rollout with the half step. The
+whole step is taken to add the error d to e, and independent errors add as squares. The step has converged if
+e^2 + d^2 is below (1.02 e)^2, that is, if d is below a fifth of e, or if d is less than 1e-3 of the velocity. A step
+must also converge on all ground truths in [simulation] confirmed_on. For coarse grids a Courant number takes the place
+of the step. The cheapest converged step is stored.
 
 The steps of the first integrator are halved until one has converged. The search with each other integrator starts at
 the shortest step that needs no more evaluations than the best step so far. It doubles the step while the final velocity
-differs by at most the tolerance from that of the most accurate rollout with the best integrator. It ends at once if
-the shortest step already differs more, because longer steps are less accurate.
+differs by at most the tolerance from a reference, the rollout with half the best step. It ends at once if the shortest
+step already differs more, because longer steps are less accurate.
 """
 
 from __future__ import annotations
@@ -48,14 +49,15 @@ TURNOVERS = 0.25  # duration of a short rollout in turnover times
 LARGEST_ERROR_SHARE, LEAST_TOLERANCE = 0.02, 1e-3
 # Largest number of halvings of a step.
 HALVINGS = 12
-# Another integrator replaces the best one if it needs less than this share of that one's time. Measured times vary.
+# Another integrator replaces the best one only if it needs less than this share of the best one's time, because
+# measured times vary.
 CHEAPER = 0.9
 
 
 class Stretch:
     """The part of a ground truth that short rollouts cover, in whole frame intervals of the rollout.
 
-    It starts at the first frame that has the unfiltered flow, or else at the second frame.
+    It starts at the first frame after frame 0 that has the unfiltered flow, or else at frame 1.
 
     Parameters
     ----------
@@ -88,7 +90,7 @@ class Trial:
     Parameters
     ----------
     stretch : the part of a ground truth that it covers.
-    seconds : wall time of a turnover, without storing.
+    seconds : wall time per turnover time, without storing.
     velocity : the final velocity in order of id; None if the rollout failed.
     """
 
@@ -110,16 +112,17 @@ class Trial:
 
     @property
     def tolerance(self) -> float:
-        """The difference d below which twice the step has converged: e^2 + d^2 = (1.02 e)^2 with the error e."""
+        """The d below which twice the step has converged: e^2 + d^2 = (1.02 e)^2 with this error e, at least 1e-3."""
         return max(math.sqrt((1 + LARGEST_ERROR_SHARE) ** 2 - 1) * self.error, LEAST_TOLERANCE)
 
 
 class Ladder:
-    """Short rollouts with one integrator. Rung 0 has the longest step, and each rung half the step of the one before.
+    """Short rollouts with one integrator. Their steps are the rungs of a ladder: rung 0 is the longest step, and each
+    further rung is half the step before it.
 
     Parameters
     ----------
-    tried : runs the rollout with a step on a stretch, when a rung is first needed.
+    tried : function that runs the rollout on a stretch with a step. It is called when a rung is first needed.
     stretches : one for each ground truth. The search is on the first; a step must converge on the others too.
     integrator, first, evaluations : name, longest step, and evaluations of the rates in a step.
     """
@@ -144,7 +147,7 @@ class Ladder:
         return self[rung].distance(self.trials.get(rung - 1))
 
     def table(self) -> dict[str, list[float]]:
-        """Columns of the table of trials, the longest step first."""
+        """Columns of the table of trials. The first row is the longest step."""
         trials = {rung: self.trials[rung] for rung in sorted(self.trials)}
         return {"size": [trial.step.size for trial in trials.values()],
                 "seconds_per_turnover": [trial.seconds for trial in trials.values()],
@@ -178,11 +181,12 @@ def cheapest(ladders: Sequence[Ladder]) -> tuple[Ladder, int] | None:
 
 
 def cheaper(ladder: Ladder, best: Ladder, of_best: int) -> int | None:
-    """The rung of a ladder's longest converged step that costs less than the best so far; None if there is none."""
+    """The rung of a ladder's longest converged step that is cheaper than the rung `of_best` of `best`, or None."""
     most = best.evaluations / best.size(of_best)
     shortest = max((rung for rung in range(HALVINGS) if ladder.evaluations / ladder.size(rung) <= most), default=-1)
     most_seconds = CHEAPER * best[of_best].seconds
-    # The cost of an evaluation varies: a corrected Verlet step, or a solve that starts from a good guess, is cheap.
+    # A shorter step may still be cheaper, because the cost of an evaluation varies: a corrected Verlet step, or a solve
+    # that starts from a good guess, is cheap.
     while 0 <= shortest < HALVINGS and 2 * ladder[shortest].seconds < most_seconds:
         shortest += 1
     rung, right = shortest, best[of_best + 1]
@@ -240,11 +244,11 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
 
 
 def integrators(settings: Simulation, span: float) -> Iterator[tuple[str, float, int]]:
-    """Yield name, longest step and evaluations per step of each integrator to search; a rollout lasts a time `span`."""
+    """Yield name, longest step and evaluations per step of each integrator to try; `span` is the rollout's duration."""
     if settings.on_grid:
         yield "etdrk4", MOST_COURANT, ETDRK4.evaluations
         return
-    # A method of the user ignores the integrator.
+    # A method of the user ignores the integrator, so one is enough.
     for name in settings.schemes if settings.method in METHODS else settings.schemes[:1]:
         scheme = SCHEMES[name]
         yield name, span if scheme.dense else settings.frame_interval, scheme.evaluations

@@ -1,4 +1,4 @@
-"""Problems of a scene on a machine and in a run directory that are known before any work. Each text names the key, its
+"""Problems of a scene, of the machine and of the run directory, found before any work. Each text names the key, its
 value, the reason and a remedy."""
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from eddies.workflows.variants import Step, steps
 
 LARGEST_MACH = 0.3           # turbulent Mach number; relative density fluctuations are about its square
 LEAST_REYNOLDS = 5.0         # Re_lambda above which large scales transfer energy to small ones
-KMAX_ETA = 1.0, 4.0          # least value that resolves the dissipation; largest value that is useful
+KMAX_ETA = 1.0, 4.0          # least k_max eta that resolves the dissipation; largest that is useful
 MOST_STEPS = 10**9           # steps of a flow or rollout, or frames: a quarter of an hour at a microsecond each
-MOST_FORCED = 50             # how many times the energy of a flow the forcing may add in one step
+MOST_FORCED = 50             # largest energy that the forcing may add in one step, divided by that of the flow
 LOG_NEGLIGIBLE_ENERGY = -40.0  # logarithm of the share of the energy below which only round-off remains
 # Largest ratio of the turnover time at the release of tracers to the expected one; least Re_lambda for this limit.
 LARGEST_TURNOVER_RATIO, TURBULENT = 3.0, 20.0
@@ -50,8 +50,8 @@ class Context:
     ----------
     comm : the ranks that run the stages.
     stages, directory, variants : arguments of `eddies.stages.run_stages`.
-    memory : bytes of each node; infinite: memory is not compared.
-    free_disk : free bytes where the run directory is; infinite: disk is not compared.
+    memory : memory of each node in bytes; if infinite, it is not checked.
+    free_disk : free bytes on the disk of the run directory; if infinite, the disk is not checked.
     """
 
     comm: Comm
@@ -75,9 +75,9 @@ def memory_of_node(comm: Comm) -> float:
 
 
 def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
-    """Return the problems of the stages of a scene and of its variants; all ranks call it and get the same.
+    """Return two lists of problems of the stages of a scene and of its variants; all ranks call it and get the same.
 
-    `eddies run` refuses the scene for the first list, and warns of the second.
+    `eddies run` refuses the scene if the first list is not empty. The second list holds warnings.
     """
     comm, planned = context.comm, steps(scene, context.stages, context.directory, context.variants)
     on_node = node_ranks(comm)
@@ -141,7 +141,7 @@ def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]
 def _strong_forcing(initial: Initial, forcing: Forcing, time: Time) -> Iterator[str]:
     """Yield a problem if the first step of the forcing makes the flow unstable."""
     if initial.flow.rms is not None:
-        step = time.step or time.max_step  # a weak flow has a long step
+        step = time.step or time.max_step  # a weak flow takes the longest step
         unit = initial.flow.rms**2 / 2     # energy divided by the square of the amplitude
         energy, gained = unit * initial.amplitude**2, forcing.injection_rate * step
         if gained > MOST_FORCED * energy:
@@ -154,7 +154,7 @@ def _strong_forcing(initial: Initial, forcing: Forcing, time: Time) -> Iterator[
 def _decay(flow: Flow, tracers: Tracers, turbulence: Turbulence) -> Iterator[str]:
     """Yield a problem if viscosity stops the flow before the end of the tracer run."""
     time = tracers.turnovers * turbulence.turnover_time
-    exponent = -2 * flow.viscosity * time  # of the largest modes, |k| = 1
+    exponent = -2 * flow.viscosity * time  # of the decay of energy at the largest scales, |k| = 1
     if exponent < LOG_NEGLIGIBLE_ENERGY and not tracers.forced:
         yield (f"[flow] viscosity = {flow.viscosity:g}: Re_lambda would be {turbulence.reynolds_lambda:.1g}, and less "
                f"than exp({exponent:.3g}) of the flow's energy would remain after [tracers] turnovers = "
@@ -230,7 +230,7 @@ def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str
             given_spectrum(scene.initial, comm)
         weights = model.weights_file if model is not None else None
         if weights is not None and weights not in made and on_first_rank(comm, weights.is_file):
-            from eddies.workflows.learned.source import read_source  # imports torch
+            from eddies.workflows.learned.source import read_source
             read_source(scene, comm)
         if scene.device != "cpu" and {"train", "simulate"} & {*stages}:
             from eddies.particles.devices import prepare_torch  # imports torch
@@ -288,7 +288,7 @@ def resolution(flow: Flow, turbulence: Turbulence) -> Iterator[str]:
 
 
 def convenient(cells: int) -> int:
-    """The next even number of cells with small prime factors, at most 7; transforms of other grids are slower."""
+    """An even number, at or just above `cells`, with prime factors up to 7; transforms on other grids are slower."""
     factors = [2 * 3**threes * 5**fives * 7**sevens for threes in range(4) for fives in range(4) for sevens in range(2)]
     return min(factor << (-(-cells // factor) - 1).bit_length() for factor in factors)
 
@@ -359,9 +359,9 @@ def rollout_steps(settings: Simulation, allowed: float | None, model: Model, uni
 
 
 def beyond_truth(settings: Simulation, tracers: Tracers, seen: float) -> Iterator[str]:
-    """Yield a warning if a rollout ends after its ground truth. `seen` is the fraction that training has used.
+    """Yield a warning if a rollout ends after its ground truth. `seen` is the fraction that training uses.
 
-    Later frames of a flow that is forced throughout are compared with the mean of the ground truth.
+    A flow that is forced throughout gives none: its later frames are compared with the mean of the ground truth.
     """
     left = (1 - (seen if settings.start is None else settings.start)) * tracers.turnovers
     if settings.turnovers > left * (1 + 1e-9) and not tracers.forced:
@@ -371,7 +371,7 @@ def beyond_truth(settings: Simulation, tracers: Tracers, seen: float) -> Iterato
 
 
 def two_digits(rounded: Callable[[float], int], value: float) -> str:
-    """A number with two digits, `rounded` by math.floor or math.ceil."""
+    """A number as text with two significant digits; `rounded` is math.floor or math.ceil."""
     digit = 10.0 ** (math.floor(math.log10(value)) - 1)
     return f"{rounded(round(value / digit, 9)) * digit:.2g}"
 
@@ -396,11 +396,11 @@ def check_span(time: Time, span: float, bound: float, tracers: Tracers | None = 
 
 
 def check_ground_truth(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path) -> None:
-    """Raise SceneError if the ground truth of a run directory has too few frames for the stages, or a scale of 0; all
-    ranks call it."""
+    """Raise SceneError if the ground truth of a run directory has too few frames for the stages or a scale of 0, or if
+    the rollout would take too many steps; all ranks call it."""
     path = directory / STAGES["dns"].file
     with open_product(comm, path, "ground_truth") as file:
-        if "particles" not in file:  # of measured tracks, none of which is in all frames; only fields are made
+        if "particles" not in file:  # measured tracks, none of them in all frames; only fields are made
             return
         check_frames(stages, scene.tracers, scene.own_training, scene.simulation, scene.seen_in(directory),
                      len(Trajectory(file, "tracers").times))

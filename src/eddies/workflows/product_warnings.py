@@ -15,14 +15,16 @@ from eddies.workflows.run_directory.work import changed_settings, of_other_setti
 
 Provenance = Mapping[str, Any]
 
-# Columns of a model's training that every step has; others are NaN in steps that do not compute them.
+# Columns of a training history with a number for every step. Other columns are NaN in steps that do not compute them.
 COLUMNS_OF_ALL_STEPS = "step", "phase", "seconds", "loss", "learning_rate", "gradient_norm"
-MOST_NAMED = 4  # places that a sentence names
+MOST_NAMED = 4  # largest number of places that a warning names
 
 
 def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
-    """Return a sentence for each product that was made from other products than those beside it. `provenance` holds
-    the provenance of each product in a run directory, by kind."""
+    """Return a sentence for each product in a run directory that was not made from the products beside it.
+
+    `provenance` maps the kind of each product in the directory to the provenance of the product.
+    """
     found = []
     for kind, origin in provenance.items():
         others = {needed: provenance.get(needed) for needed, known in origin.get("made_from", {}).items()
@@ -48,14 +50,14 @@ def changed_truths(origin: Provenance) -> list[str]:
 
 
 def not_finite(file: File, kind: str) -> str:
-    """Return a sentence on the numbers of an open product that are not finite; empty if all are finite. Of a series,
-    only the last frame is read."""
+    """Return a sentence that names the numbers of an open product that are not finite; empty if there are none. Only
+    the last frame of a series is read."""
     places = []
     for place, frame, values in stored_numbers(file):
         table, _, column = place.partition("/")
-        # A training does not compute every number in every step, and a search for a step has trials that failed.
+        # These may be NaN: a training does not compute every number in every step, and trials of a step may fail.
         gaps = kind == "step" or kind == "model" and table == "history" and column not in COLUMNS_OF_ALL_STEPS
-        # Scales without viscosity, and the sound speed of an incompressible fluid, are infinite.
+        # In a ground truth, scales without viscosity and the sound speed of an incompressible fluid are infinite.
         wrong = np.isnan(values) if kind == "ground_truth" else ~np.isfinite(values) & (not gaps)
         if wrong.any():
             row = "" if not wrong.ndim else f", row {int(np.argwhere(wrong)[0, 0])}"
@@ -73,7 +75,10 @@ def _made(kind: str, origin: Provenance) -> str:
 
 
 def _other(kind: str, origin: Provenance, present: Provenance | None) -> str:
-    """Describe the product that another product was made from, and how it differs from the `present` one."""
+    """Describe a product of this kind that is not here, and how its settings differ from the one that is here.
+
+    `origin` is the provenance of the product that was made from it, `present` that of the one that is here, or None.
+    """
     if present is None:
         return f"a {MAKER_OF[kind].file} that is not here"
     changes = changed_settings(MAKER_OF[kind], origin.get("scene"), present.get("scene"))

@@ -47,7 +47,7 @@ log = logging.getLogger("eddies")
 
 
 class Method(Protocol):
-    """Makes the modes (3, kz, ky, kx) of the velocity of particles, relative to its mean, frame by frame."""
+    """Computes the modes (3, kz, ky, kx) of the particles' velocity minus its mean, frame by frame."""
 
     def of(self, particles: ParticleSet, time: float) -> Tensor:
         """The modes at a time; collective."""
@@ -61,7 +61,7 @@ class Method(Protocol):
 
 
 class LeastSquaresMethod:
-    """Least squares for each frame alone. The iteration starts from the modes of the previous frame."""
+    """Fits the modes to each frame alone by least squares. The solve starts from the modes of the previous frame."""
 
     def __init__(self, solver: ResolvedVelocity) -> None:
         self._solver = solver
@@ -80,7 +80,7 @@ class LeastSquaresMethod:
 
 
 class NeighbourMethod(Method):
-    """Reconstructs the velocity at each grid point from its neighbours, and transforms it to modes."""
+    """Reconstructs the velocity at each grid point from the particles around it, and transforms it to modes."""
 
     def __init__(self, form: Form, grid: FourierGrid) -> None:
         self._form, self._grid = form, grid
@@ -99,9 +99,9 @@ class Source:
 
     Attributes
     ----------
-    times : of the frames. spacing : mean distance of the particles. most : largest number of particles of a frame.
+    times : times of the frames. spacing : mean distance of the particles. most : largest number in a frame.
     truth : the ground truth with true fields; None for measured tracks.
-    unit : the scene's unit of length, in that of the tracks. corner : origin of the tracks in the cube, in that unit.
+    unit : the scene's unit of length, in the unit of the tracks. corner : the tracks' origin in the cube, in that unit.
     """
 
     def __init__(self, scene: Scene, file: File, comm: Comm) -> None:
@@ -127,13 +127,13 @@ class Source:
 
 
 class ReconstructionRun:
-    """Reconstructs frame after frame and writes them to segments, from the start or from a checkpoint.
+    """Reconstructs frame after frame and writes the results to segments, from the start or from a checkpoint.
 
     Parameters
     ----------
-    source : the particles. methods : a method for all particles; with a holdout, another for those kept.
-    solver : solver on the grid of the modes. settings, tracers : [reconstruction] and [tracers].
-    viscosity, transfer : nu, and the transfer function G of the filter of the particles' velocity.
+    source : the particles. methods : one method for all particles; with a holdout, a second one for those kept.
+    solver : solver on the grid of the modes. settings, tracers : sections [reconstruction] and [tracers].
+    viscosity, transfer : nu, and the transfer function G of the filter that the particles' velocity has passed.
     """
 
     def __init__(self, source: Source, methods: Sequence[Method], solver: ResolvedVelocity, settings: Reconstruction,
@@ -153,7 +153,7 @@ class ReconstructionRun:
 
     @property
     def layout(self) -> FrameLayout:
-        """The datasets of the frames. A row of `tracks` belongs to the track in its column `track`, or to none (-1)."""
+        """The datasets of the frames. The column `track` of `tracks` names each row's track; it is -1 in empty rows."""
         values = {name: RECONSTRUCTED[name] for name in self.settings.fields}
         columns = {"track": (), "coordinates": (3,), **{name: (count,) for name, count in values.items()}}
         tracks = {"tracks": TrajectoryLayout(self.source.most, columns)} if self.settings.particles else {}
@@ -192,7 +192,7 @@ class ReconstructionRun:
         self.errors.append(row)
 
     def state_dict(self) -> dict[str, Any]:
-        """The state for a checkpoint, besides the files of the frames."""
+        """The state for a checkpoint, without the frames, which have files of their own."""
         state: dict[str, Any] = {"reconstruct": {"errors": self.errors, "of_fields": self.of_fields, "plain": []}}
         for number, method in enumerate(self.methods):
             plain = {}
@@ -215,7 +215,10 @@ class ReconstructionRun:
 
 
 def sorted_rows(comm: Comm, most: int, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """All rows on rank 0, sorted by track and filled up to `most` rows with the track -1; none on other ranks."""
+    """Collect the rows of all ranks on rank 0, sorted by track. Empty rows with the track -1 follow, up to `most` rows.
+
+    Other ranks get no rows. Collective.
+    """
     parts = comm.gather(dict(columns))
     if parts is None:
         return {name: values[:0] for name, values in columns.items()}
@@ -232,8 +235,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
 
     u is the velocity of the tracks, u* = u / G the velocity before their filter (G = 1 without a filter), and P the
     projection on solenoidal fields. The acceleration along a track is -G P[div(u* u*)] + nu laplacian u + div(u u), and
-    the pressure is G p[u*]. All contain only the modes that the particles resolve, in the units of the tracks. A
-    stopped reconstruction continues from its newest checkpoint.
+    the pressure is G p[u*]. All quantities are in the units of the tracks and contain only the modes that the particles
+    resolve. A stopped reconstruction continues from its newest checkpoint.
     """
     prepare_torch("cpu", comm)
     settings, tracers, directory = scene.reconstruction, scene.tracers, Path(directory)
@@ -297,7 +300,7 @@ class Quantities:
     Parameters
     ----------
     modes : (3, kz, ky, kx) on `grid`. mean : mean velocity (3,). transfer : G of the filter of the velocity.
-    viscosity : nu. wanted : names in RECONSTRUCTED. unit : as in `Source`.
+    viscosity : nu. wanted : quantities to compute, names in RECONSTRUCTED. unit : as in `Source`.
     """
 
     @torch.no_grad()
@@ -315,13 +318,13 @@ class Quantities:
                 - viscosity * grid.wavenumber_squared * modes)
 
     def on(self, target: SpectralGrid) -> dict[str, np.ndarray]:
-        """Planes (components, z_local, y, x) on another grid; collective."""
+        """The wanted quantities by name, as planes (components, z_local, y, x) of another grid; collective."""
         return self._of(lambda modes: target.backward(regrid(self.grid.spectral, target, as_numpy(
             modes.resolve_conj()))))
 
     @torch.no_grad()
     def at(self, particles: ParticleSet) -> dict[str, np.ndarray]:
-        """Values (n, components) at the particles of this rank; collective."""
+        """The wanted quantities by name, (n, components) at the particles of this rank; collective."""
         points = self.grid.points(particles.position)
         found = self._of(lambda modes: as_numpy(self.grid.at(modes, points)).T)
         return {name: values.T for name, values in found.items()}
@@ -345,7 +348,10 @@ class Quantities:
 
 def errors_of(modes: Tensor, mean: np.ndarray, tracers: Tracers, grid: FourierGrid, truth: GroundTruth,
               frame: int) -> dict[str, float]:
-    """Normalised L2 errors of the filtered velocity and its gradient at a frame with a field in the ground truth."""
+    """Normalised L2 errors at a frame: `velocity_error` of the filtered velocity, `gradient_error` of its gradient.
+
+    The ground truth must hold a field at this frame. Collective.
+    """
     slab = SlabDecomposition(grid.decomposition.comm, BOX_LENGTH, truth.fields.cells)
     target = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
     exact = truth.planes(truth.fields, truth.field_frames.index(frame), "velocity", slab)

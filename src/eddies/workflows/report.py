@@ -60,7 +60,7 @@ SIMULATION = "dns_seconds_per_turnover"
 SOURCE_OF_TRACKS = ("{in_file} measured tracks from {file}, on average {mean_count:.0f} in a frame; {complete} are in "
                     "all frames. Fields are reconstructed from them by least squares. The dissipation rate is the "
                     "value of the literature for this velocity and integral scale.")
-MAIN_PAGE = 3  # the main page takes as long as this number of other pages, and so does a round of pages
+MAIN_PAGE = 3  # time of the main page, and of a round of pages, in units of the time of another page
 Row = dict[str, Any]
 
 
@@ -68,8 +68,8 @@ Row = dict[str, Any]
 class Page:
     """A page of the report, made by one rank.
 
-    directory: run directory of the products. seconds: wall seconds by stage. provenance: provenance by product.
-    not_finite: a sentence on each product with numbers that are not finite. images: figures as PNG files, by name.
+    directory: run directory of the products. seconds: wall seconds by stage. provenance: provenance by kind of product.
+    not_finite: by kind, a sentence on each product with numbers that are not finite. images: PNG figures by name.
     """
 
     directory: Path
@@ -84,7 +84,7 @@ class Page:
 
     @property
     def simulation_seconds(self) -> float | None:
-        """Wall seconds of a turnover of the direct simulation; None without a ground truth."""
+        """Wall seconds per turnover of the direct simulation; None without one, or if it took no step."""
         return next((metric.value for metric in self.cost if metric.key == SIMULATION), None)
 
     def draw(self, sections: Sequence[Section]) -> None:
@@ -92,7 +92,7 @@ class Page:
         for figure in (each for section in sections for each in section.illustrations):
             try:
                 self.images[figure.name] = figures.png(figure.image)
-            except Exception as error:  # of matplotlib or its settings: the numbers and other figures are kept
+            except Exception as error:  # an error of matplotlib or its settings must not lose the rest of the report
                 log.warning("report: a figure is left out, because drawing %s fails (%s: %s)", figure.name,
                             type(error).__name__, error)
             figure.image = None
@@ -115,8 +115,8 @@ class Run:
 
     @classmethod
     def of(cls, directory: Path, first: Sequence[str] = (), output: Path | None = None) -> Run:
-        """Read a run directory. The main page shows the first variant of `first` that was run, or else
-        the first of all variants that was run."""
+        """Read a run directory. The main page shows the first variant in the list `first` that was run. If none of them
+        was run, it shows the first variant of the scene that was run."""
         scene, runs = None, {}
         with contextlib.suppress(SceneError):
             scene = load_scene(directory / "scene.toml")
@@ -142,7 +142,7 @@ class Run:
         return page / "report" if self.output is None else self.output / page.relative_to(self.directory)
 
     def links(self, page: Path) -> list[tuple[str, str]]:
-        """Titles and relative paths of the other pages, as seen from the page in a directory."""
+        """Titles and relative paths of the other pages. `page` is the directory of the page that links to them."""
         found = [] if page == self.directory else [(f"all of {self.scene.name}", self.directory)]
         found += [(name, where) for name, where in self.pages.items() if where not in (page, self.directory)
                   and not (page == self.directory and name == self.main)]
@@ -158,9 +158,10 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: S
         output: Path | None = None) -> None:
     """Write report/index.html, report/figures/*.png and report/metrics.json of a run directory; all ranks call it.
 
-    With `output` they are written there instead, and the reports of variants in directories below `output`.
-    For a scene with variants the page begins with their table, followed by the details of one: the first of `variants`
-    that was run, or the first of all. Each variant that was run also has a page of its own.
+    If `output` is given, the files are written there, and the reports of variants in directories below it.
+    The page of a scene with variants begins with the table of the variants. The details of one variant follow: the
+    first in `variants` that was run, or else the first of the scene that was run. Each variant that was run also has a
+    page of its own.
 
     Raises ProductError if the directory holds no product or a damaged one, or if the report cannot be written;
     SceneError if `variants` names an unknown variant; Stopped, before any page is written, when `stop` asks for it.
@@ -195,10 +196,11 @@ def sections_of(directory: Path, alone: Comm) -> list[Section]:
 
 def _make(stored: Run, comm: Comm, alone: Comm, stop: StopRequest,
           draw: bool = True) -> tuple[dict[str, Page], dict[str, Row]]:
-    """Make the pages and the rows of all variants. Return the pages that this rank made, and all rows.
+    """Make the pages and the rows of all variants. Return the pages of this rank and the rows of all, by variant.
 
-    All ranks measure each rollout together, for the rank that makes its page and its row. They make the pages in
-    rounds. Raises Stopped, after a variant's rollouts are measured or after a round, when `stop` asks for it.
+    All ranks measure each rollout together. The rank that makes the variant's page and row collects the results. The
+    pages are made in rounds. Raises Stopped, after a variant's rollouts are measured or after a round, when `stop` asks
+    for it.
     """
     names = list(stored.pages) + [name for name in stored.runs if name not in stored.pages]
     (makers, rounds), made, rows, truths, scanned = _makers(names, comm.size), {}, {}, {}, {}
@@ -236,9 +238,9 @@ def _make(stored: Run, comm: Comm, alone: Comm, stop: StopRequest,
 
 
 def _makers(names: Sequence[str], ranks: int) -> tuple[dict[str, int], dict[str, int]]:
-    """Return the rank that makes each page, and the round in which it does.
+    """Return two mappings by name of the page: the rank that makes it, and the round in which it is made.
 
-    The first page is the main page. It takes about as long as three others, and so does a round.
+    The first page is the main page. It takes about as long as three other pages. A round takes as long, too.
     """
     makers, rounds, load = {}, {}, [0] * ranks
     for number, name in enumerate(names):
@@ -252,8 +254,8 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
               main: bool) -> Page:
     """Read the products of a run directory and return its page, with figures that are not drawn.
 
-    scanned: results of the search for numbers that are not finite, by file; new results are added. The main page
-    shows everything. Other pages have fewer figures, and no sections on products that are links to other directories.
+    scanned: results of `not_finite` by file; new results are added. The main page shows everything. Other pages have
+    fewer figures, and no sections on products that are links to other directories.
     """
     page = Page(directory, read_stage_seconds(directory))
     readers = {
@@ -293,10 +295,10 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
 
 
 def _sections_or_notice(kind: str, page: Page, read: Callable[[], list[Section]]) -> list[Section]:
-    """Return the sections on a product, or one with a notice if numbers that are not finite make them impossible."""
+    """Return the sections on a product, or one section with a notice if numbers that are not finite prevent them."""
     try:
         return read()
-    except (ValueError, OverflowError) as error:  # from the limits of a figure, a PDF or a number of times
+    except (ValueError, OverflowError) as error:  # NaN or infinity in the limits of a figure, a PDF or a count
         if not page.not_finite:
             raise
         title = kind.replace("_", " ").capitalize()
@@ -306,7 +308,7 @@ def _sections_or_notice(kind: str, page: Page, read: Callable[[], list[Section]]
 def read_stationary_span(file: File) -> StationarySpan:
     """Return the span of an open ground_truth.h5 over which its stationary state is averaged.
 
-    Raises ProductError if the span is shorter than about a step.
+    Raises ProductError if the span holds fewer than three samples.
     """
     span, scene = read_attributes(file, "stationary"), tomllib.loads(read_provenance(file)["scene"])
     forced_below = scene["forcing"]["wavenumber"] if "forcing" in scene else 0.0
@@ -415,7 +417,7 @@ def _cost_section(page: Page) -> Section:
 
 def _table_section(stored: Run, page: Page, rows: Mapping[str, Row]
                    ) -> tuple[list[Section], table_of_variants.ErrorAgainstTime | None]:
-    """Return the section on all variants with its table; nothing if no variant was run."""
+    """Return the section on all variants, in a list, and its table; an empty list and None if no variant was run."""
     if not stored.main:
         return [], None
     of_variants = [rows[name] for name in stored.runs]
@@ -459,8 +461,8 @@ def _write_main(stored: Run, page: Page, rows: Mapping[str, Row], comm: Comm) ->
 
 def _write(page: Page, directory: Path, output: Path, links: Sequence[tuple[str, str]],
            beside: Mapping[Path, str] | None = None, scene: str | None = None) -> None:
-    """Write the page and the numbers of a run directory into `output`. `scene` is the text of the scene if it has
-    variants and the page is about all of them."""
+    """Write a page, its numbers and the files `beside` into `output`. `scene` is the text of the scene for a page about
+    all variants; without it, the page shows the scene of the last product."""
     rows = [("stage", "ranks", "wall time (s)", "date", "eddies", "commit", "libraries")]
     for kind, origin in page.provenance.items():
         stage = MAKER_OF[kind].name

@@ -1,4 +1,4 @@
-"""`eddies status`: the state of run directories: stages, their settings, checkpoints, jobs and sizes."""
+"""`eddies status` prints the state of run directories: stages, their settings, checkpoints, jobs and sizes."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _complaint(comm: Comm, path: Path) -> str | None:
 
 
 def products_in(directory: Path) -> list[Path]:
-    """The products of all runs in a directory, by name. A link to one of them is left out."""
+    """The products of all runs in a directory, sorted by path. A link to one of these products is left out."""
     names = [stage.file for stage in STAGES.values() if stage.product]
     found = sorted((path for name in names for path in directory.rglob(name)), key=Path.is_symlink, reverse=True)
     return sorted({path.resolve(): path for path in found}.values())
@@ -80,7 +80,7 @@ def _print(comm: Comm, line: str) -> None:
 
 
 def status_lines(directory: Path) -> Iterator[str]:
-    """The lines of all runs in a directory, by name. Raises UserError if it holds no run."""
+    """The lines of all runs in a directory, sorted by path. Raises UserError if the directory holds no run."""
     is_run = (directory / SCENE).is_file() or any((directory / stage.file).is_file() for stage in STAGES.values())
     found = [directory] if is_run else sorted(path.parent for path in directory.glob(f"**/{SCENE}"))
     if not found:
@@ -132,7 +132,8 @@ def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
 def stage_state(stage: Stage, directory: Path, settings: str, continued: str, text: str) -> str:
     """Describe in words the state of a stage in a directory.
 
-    `settings` is the fingerprint of the stage, `continued` that of work that it can continue, `text` the scene as TOML.
+    `settings` is the fingerprint of the stage, `continued` the fingerprint of checkpoints that it can continue, and
+    `text` the scene as TOML.
     """
     product = directory / stage.file
     origin = product_provenance(product)

@@ -1,5 +1,5 @@
 """`eddies check --time`: wall time of each stage, estimated from a few steps in a temporary directory. The stages work
-with a short ground truth of the scene's own flow, on its own grid."""
+with a short ground truth of the scene's flow, on the grid of the scene."""
 
 from __future__ import annotations
 
@@ -94,8 +94,8 @@ def run(scene: Scene, comm: Comm, signals: Sequence[int] = ()) -> None:
 
 
 def measured(name: str, measure: Callable[[], tuple[float, float, int | None]]) -> bool:
-    """Log the wall time of a stage, its seconds per step and its steps, from `measure`. Returns False if that fails.
-    If HDF5 could not write a file, the error is raised, because the job must then be aborted."""
+    """Log wall time, seconds per step and number of steps of a stage, as `measure` returns them. Returns False if
+    `measure` fails. If HDF5 could not write a file, the error is raised, because the job must then be aborted."""
     try:
         with quiet():
             seconds, step, number = measure()
@@ -120,7 +120,7 @@ def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
     """
     stop.check()
     comm, first, expected, once = stop.comm, len(stop.times), estimate(whole), few
-    if stage == "train" and few.training:  # its phases are measured one by one
+    if stage == "train" and few.training:  # `rest_of_training` measures its phases
         once = replace(few, training=replace(few.training, steps=1, combined_steps=0, horizons=None, field_weight=0.0,
                                              velocity_kl_weight=0.0, acceleration_kl_weight=0.0))
     seconds = elapsed(comm, lambda: RUN[stage](once, comm, directory, stop))
@@ -130,7 +130,7 @@ def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
         definition, device = ModelDefinition.of(few), prepare_torch(whole.device, comm)
         rest, number, step = rest_of_training(definition, few.training, whole.training.frames, directory, device, stop)
         return seconds + rest, step, number
-    if stage == "find-step":  # here its rollouts are one interval long
+    if stage == "find-step":  # assumes that its short rollouts last one frame interval here
         span = expected.rollout.turnover_time * find_step.TURNOVERS if expected.rollout else 0.0
         return seconds * max(round(span / whole.simulation.frame_interval), 1), 0.0, 0 if expected.rollout else None
     paces = [after - before for before, after in zip(stop.times[first:], stop.times[first + 1:])]
@@ -150,7 +150,8 @@ def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
 
 def rest_of_training(definition: ModelDefinition, few: Training, frames: int, directory: Path, device: torch.device,
                      stop: StopRequest) -> tuple[float, int, float]:
-    """Estimate the work that a training with one step on few frames omits: frames, and steps and validations of phases.
+    """Estimate the work that the `few` settings omit if only one step is taken: the preparation of further frames, and
+    the steps and validations of all phases. The whole training has `frames` frames.
 
     Returns the wall time of this work, the number of steps, and the mean seconds of a step.
     """
@@ -176,7 +177,7 @@ def rest_of_training(definition: ModelDefinition, few: Training, frames: int, di
 def shortened(scene: Scene, turnover: float | None) -> Scene:
     """Return a scene and its variants with few frames and steps, in a flow of a given turnover time.
 
-    With the turnover time None they have one interval of frames. The number of training steps remains.
+    If `turnover` is None, they have a single frame interval. The number of training steps does not change.
     """
     variants = {name: shortened(variant, turnover) for name, variant in scene.variant.items()}
     few, tracers, simulation, training = scene.without_variants, scene.tracers, scene.simulation, scene.training
@@ -188,7 +189,7 @@ def shortened(scene: Scene, turnover: float | None) -> Scene:
         changed["spin_up"] = replace(scene.spin_up, turnovers=LEAST_TURNOVERS, stationary=None)
     if scene.kernel:
         changed["kernel"] = replace(scene.kernel, steps=FEW_STEPS)
-    longest = between = 0        # frames of the longest horizon, and of an interval of the rollout
+    longest = between = 0        # in frames: the longest horizon, and the frame interval of the rollout
     if training:
         longest = max(training.horizons.frames) if training.horizons else 0
         frames = min(training.frames, 2 * max(len(training.truths or ()), 1))

@@ -29,8 +29,8 @@ def best_solver(particles: ParticleSet, make: Callable[[float], ResolvedVelocity
 
     `make` makes the solver for a weight. Returns the best solver, its weight, and its error relative to the rms
     velocity. The best weight depends on the filter, the errors of measured velocities and the number of particles,
-    none of which is known well. Weights are tried in descending order until the error rises by a fiftieth. If there
-    are too few particles to leave one out, the default weight is taken, and the error is NaN. Collective.
+    none of which is known well. Weights are tried in descending order until the error exceeds the least one by 2 %. If
+    there are too few particles to leave one out, the default weight is taken, and the error is NaN. Collective.
     """
     known, held_out = split(particles, share)
     default = make(WEIGHT)
@@ -56,8 +56,8 @@ def split(particles: ParticleSet, share: float) -> tuple[ParticleSet, ParticleSe
 
 
 def validation_error(solver: ResolvedVelocity, modes: torch.Tensor, known: ParticleSet, held_out: ParticleSet) -> float:
-    """Normalised L2 error of modes at particles that were left out. The modes are relative to the mean velocity of the
-    `known` ones. NaN if none was left out. Collective."""
+    """Normalised L2 error of modes at the particles that were left out. The modes are those of the velocity minus the
+    mean velocity of the `known` particles. NaN if no particle was left out. Collective."""
     comm = solver.grid.decomposition.comm
     wanted = held_out.velocity - mean_over_ranks(comm, known.velocity)
     missed = solver.grid.at(modes, solver.grid.points(held_out.position)) - wanted
@@ -66,7 +66,7 @@ def validation_error(solver: ResolvedVelocity, modes: torch.Tensor, known: Parti
 
 
 def solver_of(slab: SlabDecomposition, reference: Mapping[str, float], weight: float) -> ResolvedVelocity:
-    """The solver for a weight and the scales `reference`, named like the reference scales in a ground truth."""
+    """The solver for a weight of the noise. `reference` holds scales under their names in a ground truth."""
     scales = ReferenceScales(
         velocity=reference["velocity_rms"], acceleration=reference["acceleration_rms"],
         **{name: reference[name] for name in ("filter_width", "spacing", "density_mean", "viscosity",

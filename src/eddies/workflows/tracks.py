@@ -207,7 +207,8 @@ class FrameFlow:
                                              for modes in (as_numpy(whole), self.filtered))
 
     def scales(self, viscosity: float) -> dict[str, float]:
-        """Scales of turbulence; eps = C_eps u'^3 / L, with C_eps and Re_lambda found together."""
+        """The scales of `turbulence_scales`, and `dissipation_rate` eps = C_eps u'^3 / L. C_eps and Re_lambda depend on
+        each other, so both are found by iteration."""
         cutoff = self.resolved.grid.resolved
         found = turbulence_scales(self.energy, 0.0, 0.0, cutoff)
         speed, length = found["velocity_rms"], found["integral_scale"]

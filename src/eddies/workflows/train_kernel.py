@@ -87,7 +87,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
 
 
 def keep_form(comm: Comm, path: Path, form: str | None, provenance: Mapping[str, Any]) -> None:
-    """Write a form of reconstruction into a trained kernel file that names another one; all ranks call it.
+    """Write the name of a form of reconstruction into a trained kernel file that names another form; all ranks call it.
 
     Weights, tables and the id of the file do not change.
     """
@@ -139,7 +139,7 @@ def losses_of(training: Training) -> dict[str, np.ndarray]:
 
 
 def shapes(kernels: dict[str, SmoothingKernel], support: float) -> dict[str, np.ndarray]:
-    """W h^3 and dW/dr h^4 as functions of r/h."""
+    """Columns `r_over_h` and, for each kernel of support h, `value_NAME` W h^3 and `derivative_NAME` dW/dr h^4."""
     r = torch.linspace(0, support, 201)
     table = {"r_over_h": (r / support).numpy()}
     for name, kernel in kernels.items():
@@ -149,7 +149,7 @@ def shapes(kernels: dict[str, SmoothingKernel], support: float) -> dict[str, np.
 
 
 def compare(kernels: dict[str, SmoothingKernel], sample: KernelSample) -> dict[str, dict[str, np.ndarray]]:
-    """Errors of each kernel on a field, and the plane z = pi of u_x and du_x/dx; collective."""
+    """Two tables for a field: `errors` of each kernel, and `slices`, u_x and du_x/dx at z = pi; collective."""
     errors, slices = {}, {}
     slab = sample.decomposition
     slices["truth_velocity"] = _middle_plane(slab, sample.field[:, 0])

@@ -35,13 +35,13 @@ COST = ("seconds_per_step", "time_step", "wall_seconds", "wall_seconds_low", "wa
 SEARCH = ("step_integrator", "step_size", "step_seconds", "step_error", "step_error_half", "step_error_twice")
 BEFORE = ("weights", "training_seconds", "training_steps", *SEARCH)  # cost before the rollout
 THROUGH_KERNEL = ("qr_kl", "qr_kl_floor")  # measured on gradients that the smoothing kernel reconstructs
-# Turnovers after which training, search and rollout have taken less time than the direct simulation, and than the
-# cheapest grid whose velocity error is not larger: a number, or "never".
+# Turnovers after which training, search and rollout together have taken less time than a rival, or "never". The first
+# rival is the direct simulation, the second the cheapest grid whose velocity error is not larger.
 BREAK_EVEN = ("break_even_simulation", "break_even_grid")
 COLUMNS = ("name", "label", "method", "kind", "on_grid", "status", "stopped_at", "realisations", *MEASURES, "end",
            *COST, *BEFORE, *BREAK_EVEN, *(f"{measure}_spread" for measure in MEASURES), "settings")
 MODEL, ROLLOUT = STAGES["train"].file, STAGES["simulate"].file
-# Numbers of THROUGH_KERNEL cannot be compared between scenes whose kernels differ.
+# Fingerprint of a scene's kernel. Numbers of THROUGH_KERNEL cannot be compared between scenes whose kernels differ.
 _kernel_of = partial(stage_fingerprint, stage="train-kernel")
 
 
@@ -80,8 +80,9 @@ def missing_reason(directory: Path) -> str:
 def combined(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Combine the numbers of several realisations.
 
-    Errors become a mean and a standard deviation, if all realisations have them. Times become a median, with the widest
-    quartiles. The status comes from the first realisation that did not reach its end, if there is one.
+    Each measure becomes a mean and a standard deviation, if all realisations have it. Each time becomes a median; of
+    the quartiles, the lowest and the highest are kept. The status comes from the first realisation that did not reach
+    its end, if there is one.
     """
     found: dict[str, Any] = {"realisations": len(realised), "status": "complete"}
     found |= next(({key: one[key] for key in ("status", "stopped_at")} for one in realised
@@ -99,8 +100,8 @@ def combined(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def simulation_seconds(scene: Scene, rows: Sequence[Mapping[str, Any]], of_truth: float | None) -> float | None:
-    """Return the wall seconds per turnover of the direct simulation: those of a variant on the same
-    grid, which is timed like the other variants, or else those of the ground truth."""
+    """Return the wall seconds per turnover of the direct simulation. A variant on the same grid gives them, because it
+    is timed like the other variants. Without such a variant they are `of_truth`, those of the ground truth."""
     repeated = [row["wall_seconds"] for row in rows if row["wall_seconds"] is not None
                 and (variant := scene.variant.get(row["name"], scene)).coarse_cells == variant.flow.cells]
     return min(repeated, default=of_truth)
@@ -109,8 +110,8 @@ def simulation_seconds(scene: Scene, rows: Sequence[Mapping[str, Any]], of_truth
 def add_break_even(rows: Sequence[dict[str, Any]], simulation: float | None) -> None:
     """Add the numbers of BREAK_EVEN to the rows of trained methods.
 
-    Compares mean errors at T/2, or at the end of shorter rollouts. The search for a grid's step counts too.
-    `simulation`: wall seconds per turnover of the direct simulation, None if unknown.
+    A grid is a rival if its mean velocity error is not larger, at T/2 or, if no rollout reaches T/2, at the end. The
+    search for its step counts too. `simulation`: wall seconds per turnover of the direct simulation, None if unknown.
     """
     known = [row for row in rows if row["status"] == "complete" and row["wall_seconds"] is not None]
     measure = "velocity_error_half" if any(row["velocity_error_half"] is not None for row in known) else (

@@ -3,8 +3,8 @@
 A scene without variants and realisations has one step, in the run directory. Otherwise the run directory holds
 
     ground_truth.h5, kernel.h5            of the scene, made once
-    SET/                                  the same for a set of tracers; one simulation makes all ground truths
-    realisation-SEED/                     the same for further ground truths, which no training sees
+    SET/                                  the same files for a set of tracers; one simulation makes all ground truths
+    realisation-SEED/                     the same files for further ground truths, which no training sees
     VARIANT/                              model and rollout of a variant
     VARIANT/realisation-SEED/             its rollouts, one for each realisation
     report/                               one page about all variants
@@ -40,7 +40,7 @@ class Step:
     stages : the stages, in order. All make a product.
     directory : where they run.
     variant : name of the variant; None for what all variants share.
-    links : the directory, by stage, of each product that is made elsewhere.
+    links : by stage, the directory of each product that is made elsewhere and linked here.
     """
 
     scene: Scene
@@ -104,7 +104,7 @@ def rollouts(scene: Scene, directory: Path) -> dict[str, list[RolloutRun]]:
 
 
 def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[str] = ()) -> list[Step]:
-    """The steps for some stages of a scene, for all variants or those named, in order.
+    """The steps, in order, that run some stages of a scene for the variants in `names`, by default for all variants.
 
     Rollouts of the variants alternate, so that a slow phase of the machine slows all of them. Products that use
     trained weights of a file are never shared, because an earlier step may replace the file.
@@ -113,7 +113,8 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
         making = tuple(stage for stage in stages if stage in MAKING)
         return [Step(scene, making, directory)] if making else []
     whole, seeds = scene.without_variants, scene.realisations or ()
-    # Directory of each ground truth that a variant may use, relative to that of the scene or of a realisation.
+    # By fingerprint, the directory of each ground truth that a variant may use, relative to the directory of the scene
+    # or of a realisation.
     truths = ({fingerprint: path.parent for path, fingerprint in set_files(whole).items()}
               or {stage_fingerprint(whole, "dns"): Path()})
     realisations = tuple(directory / f"{REALISATION}{seed}" for seed in seeds)
@@ -154,7 +155,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
             if holder is not None and holder != where:
                 links[stage] = holder
                 if seeds and stage == "train" and stage in possible and stage in stages:
-                    working.append(stage)  # finds the link; rollouts on realisations take their weights from here
+                    working.append(stage)  # it finds the link; rollouts on realisations take their weights from here
             elif stage in possible and holder is None:
                 made[key] = where
                 if stage == "dns":

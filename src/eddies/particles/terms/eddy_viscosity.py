@@ -15,20 +15,22 @@ from eddies.particles.terms.pair_network import (
 from eddies.particles.terms.term import Coefficient, PairTerm
 from eddies.scene import terms as declared
 
-# Softens quotients at small distances, in squared units of the filter width.
+# Added to |x|^2 in the denominators of mu and q, which limits them at small distances; in units of d^2.
 SOFTENING = 0.1
 # Forms of Pi, in the order of their numbers in the compiled library.
 FORMS = "two-sided", "monaghan", "bounded"
 
 
 class EddyViscosity(PairTerm):
-    """dv_i/dt is a_rms times the scaled sum of w Pi b_1, with window, direction and scaling as in PairNetwork, and
+    """dv_i/dt = a_rms s sum_j w Pi b_1 with
 
         Pi = -|a_1| mu + |a_2| mu^2,   mu = x.v / (|x|^2 + 0.1),
 
-    in the units of `ScaledPairs`. A positive Pi repels. In the form "two-sided" the part mu^2 also repels receding
-    pairs. "bounded" replaces x.v by tanh(x.v), as the public code of the paper does: the force of a fast pair has a
-    limit. "monaghan" acts on approaching pairs only (mu < 0), as in SPH. Both coefficients are learned.
+    in the units of `ScaledPairs`. The window w and the scaling s are as in PairNetwork, with M_i^-1 for s in the basis
+    "corrected". b_1 is x, or x/|x| in the basis "unit". A positive Pi repels. In the form "two-sided" the part mu^2
+    also repels receding pairs. The form "bounded" replaces x.v by tanh(x.v), as the public code of the paper does: the
+    force of a fast pair has a limit. "monaghan" acts on approaching pairs only (mu < 0), as in SPH. a_1 and a_2 are
+    learned.
     """
 
     Settings = declared.EddyViscosity
@@ -73,7 +75,7 @@ class DensityDiffusion(PairTerm):
     `ScaledPairs`, as in the public code of the paper.
 
     r_rms is the rms of the density rate; w and s are window and scaling as in PairNetwork. One particle of a pair gains
-    what the other loses. Both coefficients are learned.
+    what the other loses. The coefficients b_1 and b_2 are learned.
     """
 
     Settings = declared.DensityDiffusion

@@ -12,7 +12,7 @@ from eddies.particles.rates import Rates
 from eddies.particles.terms.term import Coefficient, Term
 from eddies.scene import terms as declared
 
-# Two or more sweeps reduce all errors whose eigenvalues lie between LEAST / sweeps^2 and 1 to an eighth.
+# Two or more sweeps reduce to an eighth or less all errors whose eigenvalues lie between LEAST / sweeps^2 and 1.
 LEAST = 2.0
 
 
@@ -21,8 +21,8 @@ class FilteredEquations(Term):
 
     Derivatives of the velocity u and of p come from kriging among the neighbours (eddies.particles.kriging). v - u is
     the difference between a particle's velocity and the neighbours' estimate, and u' the present rms of a component. f
-    is learned. It is near 1, the value of the gradient model (Leonard 1975; Clark et al. 1979), whose force is
-    -f (d^2/12) d_j d_k u_i d_k u_j.
+    is learned. It is near 1, the value of the gradient model (Leonard 1975; Clark et al. 1979); the force of tau is
+    -f (d^2/12) d_j d_k u_i d_k u_j. C_r, C_d and C_p are the settings `relaxation`, `solenoidal` and `density`.
 
     p, the pressure divided by rho_0, starts from c^2 (rho/rho_0 - 1) with the particles' own density. `sweeps` steps of
     Chebyshev's iteration then reduce the residual

@@ -1,5 +1,5 @@
-"""Learned networks of pairs, the force and the density rate of Eqs. 3 and 4; and the weights, directions and scaling of
-all sums over pairs."""
+"""Networks of pairs for the force and the density rate of Eqs. 3 and 4; and the weights, directions and scaling of all
+sums over pairs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SMALL = 1e-6
 
 
 def window(pairs: ScaledPairs, settings: PairSum) -> Tensor:
-    """Factor w (m,) of each pair: (1 - q^2)^2, or 1 within the radius of interaction."""
+    """Factor w (m,) of each pair within the radius of interaction h: (1 - q^2)^2 with q = r/h, or 1."""
     return pairs.weight if settings.window == "smooth" else (pairs.weight > 0).to(pairs.weight)
 
 
@@ -84,10 +84,10 @@ def compiled_network(network: nn.Module, settings: NetworkSettings, outputs: int
 
 
 def build_network(settings: NetworkSettings, outputs: int, seed: int) -> nn.Module:
-    """Build the network of a term: from features (inputs, m) of pairs to outputs (outputs, m).
+    """Build the network of a term, which maps features (inputs, m) of pairs to outputs (outputs, m).
 
-    A network of the user is made by Network(inputs, hidden, outputs, seed). Raises TermError if that fails, or if the
-    class is not derived from torch.nn.Module.
+    A user's class is called with (inputs, hidden, outputs, seed). Raises TermError if the call fails, or if the class
+    is not derived from torch.nn.Module.
     """
     inputs = len(settings.inputs) + ("density" in settings.inputs)
     if not is_path(settings.network):
@@ -121,7 +121,8 @@ class PairNetwork(PairTerm):
     NN_1 and NN_2 are functions of the invariants of a pair (rho'_i, rho'_j, |x|, |v|, x.v) in the units of
     `ScaledPairs`. w is the window, s the scaling and M_i = sum_j w x x^T. With symmetry "antisymmetric" the first two
     invariants are rho'_i + rho'_j and (rho'_i - rho'_j)^2: the forces of a pair are opposite and conserve the total
-    momentum. They are also opposite if the densities are no inputs. In both cases each pair is evaluated once.
+    momentum. If the densities are no inputs, the summands of a pair are opposite too. In both cases each pair is
+    evaluated once.
     """
 
     Settings = declared.PairNetwork
@@ -157,9 +158,9 @@ class PairNetwork(PairTerm):
 class DensityFlux(PairTerm):
     """d rho_i/dt = r_rms s sum_j w NN_rho, or, with `sign`, r_rms s sum_j w NN_rho sign(rho_i - rho_j).
 
-    r_rms is the rms of the density rate. NN_rho is a network of its own, a function of the invariants of a pair; w, s
-    and the invariants are as in PairNetwork. The paper does not state what replaces b_k for the density. The sign is
-    taken from the public code.
+    r_rms is the rms of the density rate. NN_rho is a separate network, a function of the invariants of a pair; w, s and
+    the invariants are as in PairNetwork. The paper does not state what replaces its directions b_k for the density. The
+    sign is taken from the public code.
     """
 
     Settings = declared.DensityFlux
@@ -167,7 +168,7 @@ class DensityFlux(PairTerm):
 
     def __init__(self, settings: declared.DensityFlux, flow: FlowUnits) -> None:
         super().__init__(settings, flow)
-        # Initial weights other than those of the force.
+        # The seed differs from that of the force, and so do the initial weights.
         self.network = build_network(settings, 1, flow.seed + 1)
         self.mutual, self.width = "density" not in settings.inputs, max(settings.hidden)
         self.parity = torch.full((1,), -1.0 if settings.sign else 1.0)

@@ -80,9 +80,9 @@ def _gradient(flow: ResolvedFlow) -> Tensor:
 class Damping(Term):
     """-D(k) u for the modes of the resolved velocity u: a spectral eddy viscosity (Kraichnan 1976).
 
-    D is k_c u_c times six learned values at wavenumbers equally spaced up to the highest resolved one, k_c. It is
-    linear between them, with D(0) = 0. u_c is the present rms of a component of the smallest resolved scales, the modes
-    of the unfiltered velocity above k_c/2: the energy transfer to unresolved scales depends on them.
+    D is k_c u_c times six learned values at wavenumbers equally spaced up to the highest resolved one, k_c. D is linear
+    between these wavenumbers, with D(0) = 0. u_c is the present rms of a component of the smallest resolved scales, the
+    modes of the unfiltered velocity above k_c/2. The energy transfer to unresolved scales depends on these modes.
     """
 
     Settings = declared.Damping
@@ -132,8 +132,8 @@ class Relaxation(Term):
 class Forcing(Term):
     """f(k) = A u(k) over 0 < |k| < k_f with A = P / sum |u*(k)|^2: linear forcing of the large scales (Lundgren 2003).
 
-    The flow is forced by A u*, with u* = u / G its velocity before the filter (`flow/forcing.py`), and the power P is
-    the `injection_rate` of that flow. The filtered flow receives less, A sum |u(k)|^2. Each evaluation computes A.
+    The unfiltered flow is forced by A u*, where u* = u / G is its velocity (`flow/forcing.py`). It receives the power
+    P = `injection_rate`. The filtered flow receives less, A sum |u(k)|^2. Each evaluation computes A anew.
     """
 
     Settings = declared.Forcing

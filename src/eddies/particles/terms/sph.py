@@ -18,9 +18,9 @@ from eddies.particles.terms.term import Coefficient, PairTerm
 from eddies.scene import terms as declared
 from eddies.scene.terms import TermSettings
 
-# Softens the approach rate at small distances, in squared smoothing lengths (Monaghan 1992).
+# Added to r^2 in the denominator of mu, which limits mu at small distances; in units of h^2 (Monaghan 1992).
 SOFTENING = 0.01
-# Initial p_b delta_t over rho_0 c h.
+# Initial p_b delta_t / (rho_0 c h) in TransportVelocity.
 BACKGROUND = 0.25
 
 
@@ -49,7 +49,7 @@ class Continuity(_SPHTerm):
 
         + 2 delta h c sum_j (m/rho_j) (rho_j - rho_i) (-W'/r).
 
-    delta is the only learned parameter; its magnitude counts, since a negative value would amplify noise.
+    delta is the only learned parameter. The term uses its magnitude, since a negative value would amplify noise.
     """
 
     Settings = declared.Continuity
@@ -94,14 +94,15 @@ class WCSPH(_SPHTerm):
         P = c_P^2 rho_0/gamma ((rho/rho_0)^gamma - 1)
         Pi_ij = (-alpha c mu + beta mu^2)/mean(rho_i, rho_j),   mu = h x.v/(r^2 + 0.01 h^2),   if x.v < 0
 
-    Forces of a pair are opposite and central: momentum and angular momentum are conserved. In three dimensions Pi acts
-    like a viscosity of about alpha c h / 10. c_P in units of c, alpha and beta are learned; their magnitudes count, so
-    that pressure repels and friction dissipates. Pi keeps the c of the flow: with a learned one, a large alpha would
-    drive the pressure to zero. gamma is fixed, since it has no effect where the density hardly varies.
+    with x = x_i - x_j, v = v_i - v_j and r = |x|. Forces of a pair are opposite and central: momentum and angular
+    momentum are conserved. In three dimensions Pi acts like a viscosity of about alpha c h / 10. The learned parameters
+    are c_P/c, alpha and beta. The term uses their magnitudes, so that friction dissipates. Pi contains the c of the
+    flow: with c_P in its place, a large alpha would drive the pressure to zero. gamma is fixed, since it has no effect
+    where the density hardly varies.
 
-    This sum gives a poor pressure gradient among random particles. Differences (P_j - P_i)/(rho_i rho_j) halve the
-    error at single moments, but they do not conserve energy: it grows until the rollout stops. A shift that keeps the
-    particles in order prevents this, but then there is no gain.
+    The sum P_i/rho_i^2 + P_j/rho_j^2 gives a poor pressure gradient among random particles. Differences
+    (P_j - P_i)/(rho_i rho_j) halve the error at single moments, but they do not conserve energy: the energy grows until
+    the rollout stops. A shift that keeps the particles in order prevents this growth, but then nothing is gained.
     """
 
     Settings = declared.WCSPH
@@ -153,10 +154,10 @@ class TransportVelocity(_SPHTerm):
         w_i = -(p_b delta_t/m) sum_j (V_i^2 + V_j^2) grad W,   V = m/rho
         (w_i.grad) v = sum_j V_j (v_j - v_i) (w_i.grad W)
 
-    p_b delta_t is learned in units of rho_0 c h; its magnitude counts, since particles gather if it is negative. The
-    initial value 1/4 is that of Adami et al., pressure c^2 rho_0 and step h/(4c); here it is used with any step. They
-    use the divergence of the stress v w instead of (w.grad) v. That conserves momentum. Its part v div w, however,
-    gives random particles a larger error of the velocity than a shift without any correction.
+    p_b delta_t is learned in units of rho_0 c h. The term uses its magnitude, since particles gather if it is negative.
+    The initial value 1/4 is that of Adami et al., with p_b = c^2 rho_0 and a step of h/(4c); here it is used with any
+    step. Adami et al. use the divergence of the stress v w instead of (w.grad) v, which conserves momentum. Its part
+    v div w, however, gives random particles a larger error of the velocity than a shift without any correction.
     """
 
     Settings = declared.TransportVelocity

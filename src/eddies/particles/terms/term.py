@@ -14,10 +14,11 @@ from eddies.scene.terms import TermBase, TermError, TermSettings
 
 @dataclass(frozen=True)
 class Coefficient:
-    """A learned coefficient of a term, for reports: symbol, dimensionless parameter(s), and their effect in words.
+    """A learned coefficient of a term, for reports.
 
-    `value` is the parameter in `unit` for the flow of the term. Units are in L, T and M (eddies.io.quantities); "1" for
-    a pure number.
+    `name` is its symbol, `learned` the dimensionless parameter or parameters, and `meaning` their effect in words.
+    `value` is `learned` in `unit`, for the flow of the term. Units are in L, T and M (eddies.io.quantities); "1" for a
+    pure number.
     """
 
     name: str
@@ -28,7 +29,7 @@ class Coefficient:
 
     @classmethod
     def of(cls, name: str, learned: Tensor, meaning: str, unit: str = "1", scale: float = 1.0) -> Coefficient:
-        """Coefficient of a parameter; the parameter 1 has the value `scale`."""
+        """Coefficient of a parameter `learned`; its value in `unit` is `scale` times the parameter."""
         exact = learned.detach().double()
         return cls(name, exact.tolist(), (exact * scale).tolist(), unit, meaning)
 
@@ -36,7 +37,7 @@ class Coefficient:
 class Term(nn.Module, TermBase):
     """One term of dv_i/dt or d rho_i/dt: a module with named parameters, made from its settings for a flow.
 
-    A user's term derives from it, declares on its class of `Settings` what it reads and gives, and computes its
+    A user's term derives from this class, declares on its class of `Settings` what it reads and gives, and computes its
     contribution in `forward`, in the units of `context.flow`. All ranks evaluate a term together, also ranks without
     particles. A term is `linear` if the rates at given particles are a linear function of the parameters plus a
     constant. Training then stores the effect of each parameter at a moment instead of computing it at every step.

@@ -9,7 +9,7 @@ from eddies.scene.scene import BOX_LENGTH, Flow, Forcing, Initial, Scene, Simula
 from eddies.scene.sections import METHODS
 
 DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
-PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) divided by u' in turbulence; a component is at most four rms
+PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) divided by u' in turbulence; one component is at most about 4 u'
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ class Turbulence:
 
 @dataclass(frozen=True)
 class Rollout:
-    """Number of frame intervals of a rollout, its longest step, its number of steps, and how often it evaluates the
-    rates of the particles (0 on a coarse grid)."""
+    """Expected numbers of a rollout: turnover time of the flow, number of frame intervals, time step, number of steps,
+    and number of evaluations of the rates of the particles (0 on a coarse grid)."""
 
     turnover_time: float
     intervals: int
@@ -60,9 +60,9 @@ class Estimates:
     Parameters
     ----------
     turbulence : sustained by the forcing, or decaying from a random start; None for other flows.
-    peak_speed : maximum of |u| + |v| + |w|; None without forcing, if the flow is from a file or of the user.
+    peak_speed : maximum of |u| + |v| + |w|; None if the flow is from a file or of the user and has no forcing.
     rms_speed : rms of the velocity vector; None where `peak_speed` is None, and for a pure sound wave.
-    mach : turbulent Mach number; None without sound.
+    mach : turbulent Mach number; None for a fluid without a sound speed.
     courant_step : longest step of the direct simulation that its Courant number allows.
     step, limited_by : time step of the direct simulation, and the key of [time] that limits it.
     run_time : physical time that the direct simulation covers.
@@ -121,7 +121,7 @@ def estimate(scene: Scene) -> Estimates:
     if settings is not None:
         if turbulence is not None:
             allowed = allowed_step(settings.scheme.angle, shells, turbulence.velocity_rms)
-        # A step that is still to be found counts as one frame interval at most.
+        # A step that is still to be found is taken as one frame interval, or less where a limit applies.
         rollout_step = settings.frame_interval if math.isinf(settings.longest_step) else settings.longest_step
         if scene.coarse_cells and peak:
             rollout_step = min(rollout_step, time.courant * BOX_LENGTH / scene.coarse_cells / peak)
@@ -139,8 +139,8 @@ def estimate(scene: Scene) -> Estimates:
 def expected_turbulence(flow: Flow, initial: Initial, forcing: Forcing | None) -> Turbulence | None:
     """Turbulence that the forcing sustains, or that decays from a random start; None for other flows.
 
-    The integral scale is sqrt(2 pi) / k, with k of the forcing or of the initial peak. This is exact for the initial
-    spectrum and holds within about 10 % for forced turbulence.
+    The integral scale is sqrt(2 pi) / k, with the wavenumber k of the forcing or of the initial peak of the spectrum.
+    This is exact for the initial spectrum and holds within about 10 % for forced turbulence.
     """
     if flow.viscosity == 0:
         return None
@@ -155,7 +155,7 @@ def expected_turbulence(flow: Flow, initial: Initial, forcing: Forcing | None) -
 
 
 def peak_speed(flow: Flow, initial: Initial, turbulence: Turbulence | None) -> float | None:
-    """Expected maximum of |u| + |v| + |w|; None without forcing, if the flow is from a file or of the user."""
+    """Expected maximum of |u| + |v| + |w|; None if the flow is from a file or of the user and has no forcing."""
     if turbulence or initial.flow.turbulent:
         return PEAK_SPEED * (turbulence.velocity_rms if turbulence else initial.amplitude)
     if initial.flow.sound:

@@ -12,13 +12,14 @@ from eddies.scene.sections import NEIGHBORS
 from eddies.workflows.foreseen.numbers import expected_turbulence
 
 PEAK_VELOCITY = 4.0          # largest component of the velocity of a particle, divided by u'
-ALLOWED_VELOCITY = 6.0       # the same in the training through horizons, whose ghost planes allow for it
+ALLOWED_VELOCITY = 6.0       # the same in the training through horizons; its ghost planes allow for this velocity
 GHOST_PLANES = {"cubic": 3, "quintic": 4}
 RESOLVED = "ghost planes of the resolved velocity"
 
 
 def most_ranks(scene: Scene) -> dict[str, int]:
-    """The largest number of ranks for each limit. A variant's limit is given if it is below the scene's."""
+    """The largest number of ranks that each limit allows, by the name of the limit. A limit of a variant is included if
+    it is below all limits of the scene."""
     limits, tracers, simulation = {"a grid plane for each rank": scene.flow.cells}, scene.tracers, scene.simulation
     skin = simulation.skin * scene.interaction_radius if simulation else 0.0
     trains = "train" in scene.stages
@@ -51,7 +52,7 @@ def most_ranks(scene: Scene) -> dict[str, int]:
         if scene.reconstruction.of_neighbors:
             limits |= reach_limit(tracers, scene.kernel_support or tracers.radius_of(NEIGHBORS))
     if scene.coarse_cells:
-        # In one step particles move through as many cells as the Courant number.
+        # In one step a particle crosses at most as many cells as the Courant number.
         farther = math.ceil(max(scene.time.courant, MOST_COURANT * simulation.finds_step)) - 1
         ghosts = GHOST_PLANES[tracers.interpolation] + farther
         limits["ghost planes of the coarse grid"] = max(scene.coarse_cells // ghosts, 1)
@@ -68,7 +69,7 @@ def horizon_limits(horizons: Horizons | None, tracers: Tracers, velocity: float,
                    needs_resolved_velocity: bool) -> dict[str, int]:
     """Limits on the number of ranks from the training through horizons, where particles stay on their rank.
 
-    `velocity` is the rms of a component; `neighbors` is 0 for a model without pairs.
+    `velocity` is the rms of a velocity component; `neighbors` is 0 for a model without pairs.
     """
     limits: dict[str, int] = {}
     if horizons is None:
@@ -85,8 +86,8 @@ def horizon_limits(horizons: Horizons | None, tracers: Tracers, velocity: float,
 
 def truth_limits(path: Path, horizons: Horizons | None, tracers: Tracers, neighbors: float,
                  needs_resolved_velocity: bool) -> dict[str, int]:
-    """Limits of the training on a ground truth of another run, which may have another number of particles; empty if
-    the file is missing."""
+    """Limits on the number of ranks from the training on a ground truth of another run, which may have another number
+    of particles; empty if the file is missing."""
     reference = product_attributes(path, "reference")
     if "spacing" not in reference:
         return {}
@@ -108,18 +109,18 @@ def rank_problems(limits: Mapping[str, int], ranks: int) -> Iterator[str]:
 
 
 def reach_limit(tracers: Tracers, reach: float, when: str = "") -> dict[str, int]:
-    """The limit from the distance `reach` over which particles act on each other; `when` is appended to its name."""
+    """The limit, by its name, from the distance `reach` over which particles interact; the name ends with `when`."""
     return {f"slabs no thinner than the particles' reach {reach:.3g}{when}": thick_slabs(tracers.planes, reach)}
 
 
 def thick_slabs(planes: int, width: float) -> int:
-    """The largest number of slabs, cut from a number of planes, that are no thinner than `width`."""
+    """The largest number of slabs into which the planes can be divided if no slab may be thinner than `width`."""
     return max(planes // math.ceil(width / (BOX_LENGTH / planes) - 1e-9), 1)
 
 
 def resolved_grid_ranks(tracers: Tracers, outside: float) -> int:
-    """The largest number of ranks for the cubic splines on the grid of the resolved velocity. They need one more ghost
-    plane for each plane that a particle may be outside its slab."""
+    """The largest number of ranks for the cubic splines on the grid of the resolved velocity. The splines need one more
+    ghost plane for each plane in the distance `outside` by which a particle may leave its slab."""
     planes = tracers.planes
     ghosts = GHOST_PLANES["cubic"] - 1 + max(math.ceil(outside * planes / BOX_LENGTH - 1e-9), 1)
     return max(planes // ghosts, 1)

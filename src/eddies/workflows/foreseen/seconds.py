@@ -1,7 +1,10 @@
-"""Wall time of a stage by a formula, for batch requests: within a factor of three. `eddies check --time` measures it.
+"""Wall time of a stage for batch requests, by a formula that holds within a factor of three.
 
     seconds = START + (transforms x TRANSFORM + pairs x (PAIR + weights x WEIGHT)) / ranks
             + calls x (CALL + ROUNDS x (ranks - 1) x MESSAGE)
+
+Here `transforms` is the number of transforms times that of grid points, `pairs` that of pairs of particles, `weights`
+that of weights of networks, and `calls` that of evaluations and iterations. `eddies check --time` measures the time.
 """
 
 import math
@@ -16,24 +19,25 @@ from eddies.time_stepping import ETDRK4, STEPPERS
 from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_FRAMES
 
-# Measured seconds on one and two cores of an AMD EPYC with AVX-512 (`tiny`, `hit-small`, `hit-coarse`). TRANSFORM: a
-# transform, for each grid point, times 1 + cells / CACHED in the direct simulation, whose planes outgrow the caches.
-# PAIR: a pair of particles. WEIGHT: a weight of a network, for each pair. CALL: overhead of an evaluation or iteration.
-# MESSAGE: a message; a call has ROUNDS of them for each further rank. START: overhead of a stage. The others are not
-# seconds. TRACER: pairs that cost as much as a step of a tracer. SINGLE: cost in single over double precision.
+# Seconds, measured on one and two cores of an AMD EPYC with AVX-512 (`tiny`, `hit-small`, `hit-coarse`). TRANSFORM: a
+# transform, per grid point. PAIR: a pair of particles. WEIGHT: a weight of a network, per pair. CALL: overhead of an
+# evaluation or iteration. MESSAGE: a message. START: overhead of a stage.
+# Ratios. CACHED: a transform of the direct simulation takes 1 + cells / CACHED times as long, as its planes outgrow the
+# caches. TRACER: number of pairs that take as long as a step of a tracer. SINGLE: time in single over double precision.
+# ROUNDS: messages in a call, for each further rank.
 TRANSFORM, CACHED, SINGLE, PAIR, TRACER, WEIGHT = 4e-9, 550, 0.65, 2.5e-8, 200, 6e-11
 CALL, MESSAGE, ROUNDS = 2.5e-4, 2e-6, 4
 START = {"dns": 0.4, "train-kernel": 0.7, "reconstruct": 1.0, "train": 1.0, "find-step": 0.5, "simulate": 0.3,
          "report": 2.3}
-DERIVATIVES = 3              # cost of a neighbour in kriging of all derivatives at particles, relative to averages
-FORM_PAIRS = {"average": 1, "linear": 1.5, "quadratic": 2.5, "kriging": 6}  # cost of a neighbour relative to averages
+DERIVATIVES = 3              # cost of a neighbour in kriging of all derivatives at particles; 1 in averages
+FORM_PAIRS = {"average": 1, "linear": 1.5, "quadratic": 2.5, "kriging": 6}  # cost of a neighbour, by form
 SEARCH, CONFIRM = 2, 0.75    # turnovers that a search simulates on the first ground truth, and on each further one
 COLD, ITERATION = 25, 12     # iterations of a solve without a first guess; transforms in each iteration
 GRADIENT = 4                 # cost of an evaluation with its gradient, relative to one without
 
 
 def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
-    """Wall time of a stage; None where the number of its steps is unknown."""
+    """Wall time of a stage in seconds; None if the number of its steps is unknown."""
     tracers, kernel, model, expected = scene.tracers, scene.kernel, scene.model, estimate(scene)
     rollout = expected.rollout
     transforms = pairs = calls = solves = weights = 0.0
@@ -66,7 +70,7 @@ def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
         if training := scene.own_training:
             calls = GRADIENT * training.steps_in_all
             solves, pairs = solves + training.frames + 1, GRADIENT * training.steps * training.batch * neighbors
-            if training.field_weight > 0:  # in a cube of a quarter of the box, and around it
+            if training.field_weight > 0:  # in a cube with a quarter of the box's edge, and around it
                 width = min(1 / 4 + 2 * scene.kernel_support / BOX_LENGTH, 1)
                 pairs += GRADIENT * training.combined_steps * tracers.particles * width**3 * kernel.neighbors
             if horizons := training.horizons:

@@ -1,5 +1,5 @@
-"""Memory of a rank and disk that the stages of a scene need, in bytes. The constants were measured with `tiny` to `hit`
-on one and two ranks, and with thin slabs of 1024^3 cells."""
+"""Estimates of the memory of a rank, and of the disk space, that the stages of a scene need, in bytes. The constants
+were measured with `tiny` to `hit` on one and two ranks, and with thin slabs of 1024^3 cells."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from eddies.spectral.fourier_passes import BLOCK_BYTES
 from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_PARTICLES, unfiltered_frames, whole_cells
 
-# A process before any field, without and with torch; a report with its figures.
+# Memory of a process that holds no field, without and with torch; memory of a report with its figures.
 FLOW_PROCESS, TORCH_PROCESS, REPORT_PROCESS = 100e6, 285e6, 280e6
-# Direct simulation, by whether the fluid is compressible: bytes of a cell in float64, and number of work arrays of two
-# planes. Bytes of a tracer.
+# Direct simulation: bytes of a cell in float64, and number of work arrays of at least two planes, both by whether the
+# fluid is compressible; bytes of a tracer.
 CELL_BYTES, BLOCK_ARRAYS, TRACER_BYTES = {True: 320, False: 220}, {True: 64, False: 32}, 300
-# Bytes in the evaluation of a model: of a particle, a point of its grid, a listed neighbour. Bytes in the training of
-# the kernel: of a neighbour of a grid point, a particle in the table of a field.
+# Bytes in the evaluation of a model: of a particle, a point of its grid, a neighbour in the neighbour lists. Bytes in
+# the training of the kernel: of a neighbour of a grid point, a particle in the table of a field.
 PARTICLE_BYTES, POINT_BYTES, NEIGHBOR_BYTES, GRADIENT_BYTES, TABLE_BYTES = 800, 160, 8, 200, 1100
 # Bytes on disk: of a product without its frames, a report, a row of the statistics without the spectrum.
 PRODUCT_BYTES, REPORT_BYTES, SAMPLE_BYTES = 45_000, 10e6, 200
@@ -48,7 +48,7 @@ def memory(scene: Scene, stage: str, ranks: int) -> float:
         return TORCH_PROCESS + evaluation + (CELL_BYTES[True] * planes**3 / ranks if scene.coarse_cells else 0.0)
     if scene.training and scene.training.field_weight > 0:
         evaluation += NEIGHBOR_BYTES * kernel.neighbors * own
-    frames = scene.own_training.frames + 2 if scene.own_training else 1  # each with lists and a grid
+    frames = scene.own_training.frames + 2 if scene.own_training else 1  # each has neighbour lists and a grid
     return TORCH_PROCESS + frames * evaluation
 
 
@@ -63,8 +63,8 @@ def flow_memory(flow: Flow, tracers: Tracers | None, ranks: int) -> float:
 
 
 class Disk(NamedTuple):
-    """Disk of a stage in bytes. kept: what it leaves in the run directory, None if unknown. scratch: files that it
-    removes at its end. other_files: the part of `kept` that is not in its product."""
+    """Disk space of a stage in bytes. `kept` is what the stage leaves in the run directory, None if unknown. `scratch`
+    is what it removes at its end. `other_files` is the part of `kept` that is not in its product."""
 
     kept: float | None
     scratch: float = 0.0
@@ -72,20 +72,20 @@ class Disk(NamedTuple):
 
 
 def disk(scene: Scene, stage: str) -> Disk:
-    """Disk that a stage needs."""
+    """Disk space that a stage needs."""
     flow, tracers, expected = scene.flow, scene.tracers, estimate(scene)
     if stage == "dns":
         k_max, intervals = flow.largest_wavenumber, expected.frame_intervals
         statistics = (SAMPLE_BYTES + 8 * (math.ceil(math.sqrt(3) * k_max) + 1)) * ((expected.steps or 0) // EVERY)
         state = flow.components * (2 * k_max + 1) ** 2 * (k_max + 1) * 2 * flow.real_bytes
-        checkpoints = KEPT * state    # KEPT + 1 while one is written; `state` counts the one that stays
+        checkpoints = KEPT * state    # KEPT + 1 exist while one is written; one stays, as `state`
         if tracers is None:
             return Disk(state + statistics + 4 * flow.components * flow.cells**3, checkpoints, state)
         during, after = (
             trajectory_bytes(flow, tracers, frames,
                              len(unfiltered_frames(scene.simulation, scene.training, tracers.field_every, frames)))
             for frames in (intervals or 0, (intervals or 0) + 1))
-        if tracers.sets:  # each has the statistics; the run directory has the final fields and no last state
+        if tracers.sets:  # each set has the statistics; the run directory has the final fields and no last state
             after += len(tracers.sets) * statistics + 4 * flow.components * flow.cells**3
             state = 0
         return Disk(None if intervals is None else state + statistics + after, checkpoints + during, state)
@@ -105,7 +105,7 @@ def disk(scene: Scene, stage: str) -> Disk:
 
 
 def most_disk(work: Iterable[Disk]) -> float:
-    """The disk that stages, one after the other, need at the worst moment."""
+    """The most disk space that stages need at any moment, if they run one after the other."""
     left = most = 0.0
     for needed in work:
         left += needed.kept or 0.0

@@ -1,4 +1,4 @@
-"""The direct simulation in time, alone or with tracers whose frames are stored, and its state for checkpoints."""
+"""A run of the direct simulation, alone or with tracers whose frames are stored, and its state for checkpoints."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class FlowRun:
         while self.clock.running:
             self.guard(self, self.tracers.segments if self.tracers else None)
             step = (step_limit or self.step_limit)(self.state, self.clock)
-            with np.errstate(over="ignore", invalid="ignore"):  # the watch reports it
+            with np.errstate(over="ignore", invalid="ignore"):  # the watch reports both
                 state = self.stepper(self.state, step)
                 self.clock.tick(step)
                 self.watch(self.state, state, step, self.clock)
@@ -98,7 +98,7 @@ class TracerSet:
     ----------
     fluid, state : the flow.
     settings, seed : the set, and the seed of random places.
-    saved : the checkpoint, or None for a release.
+    saved : the checkpoint, or None to release new particles.
     suffix : ends the names of the set's series in segments and of its arrays in checkpoints; empty for the only set.
     """
 
@@ -120,7 +120,7 @@ class TracerSet:
         self.spectra = {name: [] if saved is None else list(saved[f"spectra_{name}{suffix}"]) for name in names}
 
     def store(self, segments: FrameSegments, state: np.ndarray, step: int, time: float, with_fields: bool) -> None:
-        """Store the particles at a time since the release and, `with_fields`, filtered fields and spectra."""
+        """Store the particles and, if `with_fields`, filtered fields and spectra; `time` counts from the release."""
         columns, compressible = self.tracers.columns, self.fluid.compressible
         order = IdOrder(self.comm, columns["id"], self.settings.particles)
         frame = {name: order.apply(columns[name]) for name in ("position", "velocity")}
@@ -164,14 +164,16 @@ class TracerRun:
     """Releases tracers into a flow, or takes them from a checkpoint, and follows them to the end.
 
     Within a frame interval all steps are equal: the longest allowed steps that divide it, so that frames are equally
-    spaced. `released` is the sample of the flow at the release, `sets` are the sets by name, "" for a single one.
+    spaced. `released` is the sample of the flow at the release. `sets` holds the sets by name; the name of a single set
+    is "".
 
     Parameters
     ----------
     flow : its forcing ends at the release unless [tracers] forced is true.
     segments : the files for the frames.
     settings, seed : [tracers], and the seed of random places.
-    whole : for a number of frames, returns the frames that store the unfiltered flow. All have filtered fields.
+    whole : function that returns, for a number of frames, those that also store the unfiltered flow. All of these have
+        filtered fields.
     saved : the checkpoint, or None.
     """
 
@@ -283,12 +285,12 @@ def frame_layout(settings: Tracers, compressible: bool, cutoff: int) -> FrameLay
 
 
 def series_of(name: str) -> dict[str, str]:
-    """The names of a set's series in `frame_layout`, each with its name in the ground truth of the set."""
+    """The names of a set's series in the ground truth of the set, by their names in `frame_layout`."""
     return {f"{series}{suffix_of(name)}": series for series in ("tracers", "filtered")} | {"unfiltered": "unfiltered"}
 
 
 def saved_modes(grid: SpectralGrid, modes: np.ndarray) -> Block:
-    """Modes (..., kz, ky, kx) of a grid for a checkpoint. Ranks share the axis ky."""
+    """Modes (..., kz, ky, kx) of a grid for a checkpoint. The axis ky is divided among the ranks."""
     return Block(modes, int(grid.column_starts[grid.decomposition.rank]), grid.modes, axis=modes.ndim - 2)
 
 

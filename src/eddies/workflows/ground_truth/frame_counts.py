@@ -1,7 +1,7 @@
 """Which frames of a ground truth the stages use, and whether they are enough.
 
-`frames` is the number of frames, `field_frames` are the frames at whose time a filtered field is stored, and `seen` is
-the fraction of the ground truth that the model is trained on.
+In all functions, `frames` is the number of frames, `field_frames` are the numbers of the frames with a filtered field,
+and `seen` is the training window as a fraction of the ground truth.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from eddies.scene.scene import SceneError, Simulation, Tracers, Training
 
 HELD_OUT = 0.1               # share of the training window, at its end, for validation; at least the longest horizon
 KERNEL_FIELDS = 4            # filtered fields that the kernel is trained on
-TESTED_FRAMES, TESTED_PARTICLES = 9, 20_000  # of the a-priori test; it stores the rates of these particles
+TESTED_FRAMES, TESTED_PARTICLES = 9, 20_000  # frames of the a-priori test; particles whose rates it stores
 
 
 def check_frames(stages: Sequence[str], tracers: Tracers, training: Training | None, simulation: Simulation | None,
@@ -29,7 +29,7 @@ def check_frames(stages: Sequence[str], tracers: Tracers, training: Training | N
 
 
 def last_seen(window: float, frames: int) -> int:
-    """The last frame of the training window, which is a fraction of the ground truth; 0 without a window."""
+    """The last frame of the training window, the fraction `window` of the ground truth; 0 without a window."""
     return max(int(window * (frames - 1)), 1) if window > 0 else 0
 
 
@@ -49,7 +49,7 @@ def last_trained_on(settings: Training, frames: int) -> int:
 
 def trained_frames(settings: Training, frames: int, field_frames: Sequence[int]) -> tuple[list[int], int]:
     """The frames for training, and the last frame for validation. A field loss that compares with the flow needs a
-    filtered field one frame later. Raises SceneError if no frame remains."""
+    filtered field one frame later. Raises SceneError if none remains for training or for validation."""
     learned, last = last_trained_on(settings, frames), last_seen(settings.window, frames)
     fields = set(field_frames)
     usable = [frame for frame in range(1, last) if not settings.wants_fields or frame + 1 in fields]
@@ -84,10 +84,10 @@ def rollout_start(settings: Simulation, tracers: Tracers, seen: float, frames: i
 
 
 def unfiltered_frames(settings: Simulation | None, training: Training | None, every: int, frames: int) -> set[int]:
-    """The frames with the unfiltered state, for coarse grids. Every `every`-th frame has a filtered field.
+    """The frames with the unfiltered state, from which rollouts on coarse grids start.
 
-    Rollouts start at these frames: at the start of [simulation], and, where the model is not trained on this ground
-    truth, at the earliest frame.
+    They are the frame of [simulation] start and, for models that are not trained on this ground truth, the earliest
+    frame. Both are rounded up to a frame with a filtered field, that is, to a multiple of `every`.
     """
     starts, seen = (0.0, settings.start) if settings else (), training.window if training else 0.0
     return {math.ceil(_frame_at(start, seen, frames) / every) * every for start in starts}
@@ -99,5 +99,5 @@ def whole_cells(cutoff: int) -> int:
 
 
 def _frame_at(fraction: float | None, seen: float, frames: int) -> int:
-    """The frame at a fraction of the ground truth, at least 1; for None the end of the part that is seen."""
+    """The frame at a fraction of the ground truth, at least 1. None means the end of the training window."""
     return max(last_seen(seen if fraction is None else fraction, frames), 1)

@@ -39,7 +39,7 @@ def build_fluid(flow: Flow, forcing: Forcing | None, comm: Comm) -> Fluid:
 
 
 def build_step_limit(time: Time, flow: Flow, grid: SpectralGrid) -> CourantLimit | FixedStep:
-    """The choice of the time step: fixed, or by the Courant number, with sound for the explicit stepper only."""
+    """The limit of the time step: fixed, or a Courant number, which includes sound for the explicit stepper only."""
     if time.step is not None:
         return FixedStep(time.step)
     explicit_sound = flow.sound_speed if time.explicit and flow.compressible else 0.0
@@ -80,7 +80,7 @@ def _velocity_of_user(initial: Initial, seed: int, grid: SpectralGrid) -> np.nda
 
 
 def given_spectrum(initial: Initial, comm: Comm) -> tuple[np.ndarray, np.ndarray]:
-    """Wavenumbers and E(k) of the file of [initial] path; all ranks call it. Raises SceneError if it is unfit."""
+    """Wavenumbers and E(k) in the file of [initial] path; all ranks call it. Raises SceneError if it is unfit."""
     try:
         return on_first_rank(comm, lambda: read_spectrum(initial.file))
     except ProductError as error:
@@ -117,7 +117,7 @@ def _state_from_file(initial: Initial, fluid: Fluid) -> np.ndarray:
     if "density" in stored:
         density = regrid(whole, grid, whole.forward(np.log(stored["density"])))
         if stored_speed not in (None, fluid.sound_speed):
-            # The same density would mean another pressure. What is not in balance with the velocity becomes sound.
+            # The same density would mean another pressure. A pressure out of balance with the velocity becomes sound.
             density *= (stored_speed / fluid.sound_speed) ** 2
             if comm.rank == 0:
                 log.info("dns: the flow in the file has the sound speed %g; fluctuations of ln(density) are "

@@ -1,4 +1,4 @@
-"""Frames of measured tracks in the units of a scene: velocities by splines, gaps and lost tracks."""
+"""Frames of measured tracks in the units of a scene. Splines give missing velocities. Tracks may have gaps."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from eddies.scene.sections import Tracks as Settings
 UNEQUAL = 0.01    # largest deviation of a time from equal intervals, divided by the interval
 SAME = 1e-3       # fraction of the longest interval below which two times are the same frame
 LEAST_FRAMES = 3
-MARGIN = 4.0      # spacings between a volume and its periodic image
+MARGIN = 4.0      # distance between a volume and its periodic image, in mean particle spacings
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,10 @@ class MeasuredTracks:
 
     Parameters
     ----------
-    times : from 0 on, (frames,). starts : first row of each frame, and the number of rows, (frames + 1,).
-    columns : id (rows,), position and velocity (rows, 3), and, if asked for, density / mean density (rows,).
-    throughout : whether the track of a row is there in all frames, (rows,).
+    times : times of the frames, from 0 on, (frames,).
+    starts : first row of each frame, and at the end the number of rows, (frames + 1,).
+    columns : id (rows,), position and velocity (rows, 3), and, with [tracks] sound_speed, density / its mean (rows,).
+    throughout : whether the track of a row is present in all frames, (rows,).
     spacing : mean distance of the particles of a frame, in the volume in which they are.
     unit : the scene's unit of length, in the file's unit. corner : the file's origin in the cube, in the file's unit.
     about : the attributes of the product that describe the file and the tracks.
@@ -57,11 +58,11 @@ class MeasuredTracks:
 
     @property
     def complete(self) -> int:
-        """Number of tracks that are there in all frames."""
+        """Number of tracks that are present in all frames."""
         return int(self.throughout[:self.starts[1]].sum())
 
     def frame(self, number: int, complete: bool = False) -> dict[str, np.ndarray]:
-        """The rows of a frame. With `complete` only tracks that are there in all frames, with new ids 0, 1, ..."""
+        """The rows of a frame; if `complete`, only tracks that are present in all frames, with new ids 0, 1, ..."""
         rows = np.arange(*self.starts[number:number + 2])
         if not complete:
             return {name: values[rows] for name, values in self.columns.items()}
@@ -69,14 +70,14 @@ class MeasuredTracks:
         return {name: values[rows] for name, values in self.columns.items()} | {"id": np.arange(len(rows))}
 
     def shared(self, number: int, other: int) -> dict[str, np.ndarray]:
-        """The rows of a frame whose tracks are in another frame too."""
+        """The rows of frame `number` whose tracks are also in frame `other`."""
         rows, others = (np.arange(*self.starts[frame:frame + 2]) for frame in (number, other))
         rows = rows[np.isin(self.columns["id"][rows], self.columns["id"][others])]
         return {name: values[rows] for name, values in self.columns.items()}
 
 
 class TrackFrames:
-    """The frames of a file with tracks, which rank 0 holds; all ranks make one, and call its methods together."""
+    """The frames of a file with tracks; rank 0 holds them. All ranks make this object and call its methods together."""
 
     def __init__(self, comm: Comm, settings: Settings) -> None:
         self.comm = comm
@@ -90,7 +91,7 @@ class TrackFrames:
         return self._block(lambda tracks: tracks.frame(number, complete))
 
     def shared(self, number: int, other: int) -> dict[str, np.ndarray]:
-        """This rank's block of the rows of a frame whose tracks are in another frame too (`MeasuredTracks.shared`)."""
+        """This rank's block of the rows that two frames share (`MeasuredTracks.shared`)."""
         return self._block(lambda tracks: tracks.shared(number, other))
 
     def _block(self, rows: Callable[[MeasuredTracks], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -112,7 +113,7 @@ def read_measured(settings: Settings) -> MeasuredTracks:
     return _read_measured(settings, state and (state.st_size, state.st_mtime_ns))
 
 
-@lru_cache(maxsize=1)  # a run asks twice
+@lru_cache(maxsize=1)  # a run reads a file more than once
 def _read_measured(settings: Settings, state: tuple[int, int] | None) -> MeasuredTracks:
     found = read_tracks(settings.file, settings.format, settings.group, settings.interval)
     found, edge, volume, corner = _placed(found, settings)

@@ -61,9 +61,9 @@ class GroundTruth:
         return migrate(self.decomposition, self.block(frame))
 
     def particles_with_rates(self, frame: int) -> dict[str, np.ndarray]:
-        """`particles`, with `acceleration` (n, 3) and `density_rate` (n,), by centred differences along trajectories.
+        """Columns of `particles`, and the rates `acceleration` (n, 3) and, if a density is stored, `density_rate` (n,).
 
-        Raises ValueError for the first and the last frame.
+        The rates are centred differences along trajectories. Raises ValueError for the first and the last frame.
         """
         if not 0 < frame < len(self.times) - 1:
             raise ValueError(f"frame {frame} of {len(self.times)} has no frames on both sides")
@@ -75,8 +75,8 @@ class GroundTruth:
         return migrate(self.decomposition, columns)
 
     def window(self, frame: int, length: int) -> dict[str, np.ndarray]:
-        """`particles` of a frame, with their values in the next frames: `position_later` and `velocity_later`
-        (n, length, 3), `density_later` (n, length)."""
+        """Columns of `particles` at a frame, and values of the same particles in the next frames:
+        `position_later` and `velocity_later` (n, length, 3), `density_later` (n, length)."""
         columns = self.block(frame)
         later = [self.block(frame + number) for number in range(1, length + 1)]
         for name in ("position", *self._evolving):
@@ -84,7 +84,7 @@ class GroundTruth:
         return migrate(self.decomposition, columns)
 
     def planes(self, series: FieldSeries, index: int, variable: str, slab: SlabDecomposition) -> np.ndarray:
-        """The planes of a slab, from `fields` or `states`, in double precision: (components, z_local, y, x)."""
+        """The planes (components, z_local, y, x) of a slab, in double precision; `series` is `fields` or `states`."""
         return self._together(lambda: series.read(index, variable, slab.start, slab.stop)).astype(np.float64)
 
     @cached_property
@@ -106,7 +106,7 @@ class GroundTruth:
         return field.reshape(3, -1).T.astype(np.float64)
 
     def block(self, frame: int, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """The named columns, or all, of this rank's block of ids at a frame."""
+        """The columns `names`, by default all, at a frame, of the particles in this rank's block of ids."""
         start, stop = id_block(self.decomposition.comm, self.total)
         names = ("position", *self._evolving) if names is None else names
         columns = self._together(lambda: {name: self.trajectory.read(frame, name, start, stop) for name in names})

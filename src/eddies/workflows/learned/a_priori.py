@@ -35,7 +35,10 @@ def evaluation_frames(truth: GroundTruth) -> np.ndarray:
 @torch.no_grad()
 def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, last_seen: int,
              dtype: torch.dtype) -> dict[str, dict[str, np.ndarray]]:
-    """Normalised L2 errors by the delay since frame `last_seen`, and samples of rates at the last frame; collective.
+    """Test a model at some frames, and return tables by name; collective.
+
+    `acceleration_sample` and, if learned, `density_rate_sample` hold true and predicted rates at the last frame.
+    `a_priori` has a row for each frame, with the `delay` since frame `last_seen` and these normalised L2 errors:
 
     `acceleration_error`: the model as in a rollout, with the density that its terms give.
     `true_density_acceleration_error`: the model with the true density.
@@ -71,7 +74,7 @@ def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, las
 
 
 def _given_rate_error(truth: GroundTruth, dynamics: ParticleDynamics, index: int) -> float:
-    """Error of the rate of change of the density that terms give, by centred differences along true trajectories."""
+    """Error of the rate of change of the density that terms give, in centred differences on true trajectories."""
     comm, total = truth.decomposition.comm, truth.total
 
     def density(frame: int) -> np.ndarray:

@@ -20,7 +20,7 @@ from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Model, Scene, SceneError, Tracers
 
-# Keys that terms had in version 1.0, with the values at which they are now fixed.
+# Keys of terms in version 1.0 that later versions lack, with the values to which these are fixed.
 FORMER = {"force": True, "kernel": "cubic-spline", "background": 0.25}
 
 
@@ -58,7 +58,7 @@ class ModelDefinition:
         return {"terms": settings, "scales": scales.to_dict(), **neighbors}
 
     def differences(self, description: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
-        """Yield key, value here and stored value, as TOML, where this definition differs from a stored description.
+        """Yield key, own value and stored value, as TOML, for each difference from a stored description.
 
         Classes are compared by name, so that no class is imported because a file names it.
         """

@@ -86,7 +86,7 @@ class TrainingData:
         if resolution is None and settings.energy_weight > 0:
             resolution = ResolvedVelocity.on_slabs(slab, self.model.flow.scales, drift, self.dtype)
         if resolution is not None:
-            # Gradients are with respect to the particles alone, so an extrapolated start must not affect the result.
+            # Gradients are taken with respect to particles only: an extrapolated guess must not affect a solution.
             resolution.tolerance_predicted = resolution.tolerance
         starts = evenly(self.learned - self.longest + 1, self.count)
         windows = [self._window(start, resolution) for start in starts]
@@ -104,7 +104,7 @@ class TrainingData:
         later = {name: torch.from_numpy(columns[f"{name}_later"]).to(device).movedim(1, 0).contiguous()
                  for name in ("position", "velocity", "density") if f"{name}_later" in columns}
         particles = particles_for(self.model, columns, device)
-        # Stored positions are wrapped into the box; these continue from the positions of the first frame.
+        # Stored positions are wrapped into the box; `position` continues from the first frame.
         position = particles.position + PeriodicBox(BOX_LENGTH).displacement(later["position"], particles.position)
         moments = [particles, *(ParticleSet(particles.id, *moved) for moved in zip(position, later["velocity"]))]
         energies = None
@@ -135,7 +135,7 @@ def training_data(definition: ModelDefinition, settings: Training, truths: Seque
 
 def load_frame(truth: GroundTruth, index: int, model: LagrangianModel, dtype: torch.dtype,
                with_field: bool = False) -> TrainingFrame:
-    """A frame with its true rates, and `with_field` also the filtered field one frame later; collective.
+    """A frame with its true rates and, if `with_field`, the filtered field one frame later; collective.
 
     The particles have the true density if the model integrates the density.
     """
@@ -159,7 +159,7 @@ def _field_after(truth: GroundTruth, frame: int, dtype: torch.dtype) -> FieldLat
     slab, device = truth.decomposition, truth.device
     columns = truth.window(frame, 1)  # rows as in `particles_with_rates`
     position, later = (torch.from_numpy(columns[name]) for name in ("position", "position_later"))
-    # Stored positions are wrapped into the box; these continue from the positions of the frame.
+    # Stored positions are wrapped into the box; `moved` continues from the positions of the frame.
     moved = position + PeriodicBox(slab.length).displacement(later[:, 0], position)
     points = grid_points(slab, truth.fields.cells)
     field = torch.from_numpy(truth.field_at(frame + 1, points))

@@ -26,7 +26,7 @@ log = logging.getLogger("eddies")
 
 # Particles for the validation error of the acceleration, and cubes or batches for the validation error of all losses.
 VALIDATION_PARTICLES, COMBINED_DRAWS = 8192, 8
-# Number of validations in a phase.
+# Number of validations in a phase on single frames, and in a phase on windows.
 VALIDATIONS, HORIZON_VALIDATIONS = 25, 4
 # Least number of validations within the patience of a phase.
 LEAST_VALIDATIONS = 4
@@ -35,7 +35,7 @@ Trainer = TypeVar("Trainer")
 
 
 def one_step_phases(data: Sequence[TrainingData], kernel: SmoothingKernel | None) -> list[Phase]:
-    """Phases on the rates of single frames: the trajectory loss alone, then all losses."""
+    """Phases of training on the rates of single frames: first the trajectory loss alone, then all losses."""
     settings = data[0].settings
     if data[0].definition.model.foreign:
         first = data[0].frames[0]
@@ -63,7 +63,7 @@ def one_step_phases(data: Sequence[TrainingData], kernel: SmoothingKernel | None
 
 
 def horizon_phases(data: Sequence[TrainingData]) -> list[Phase]:
-    """Phases on windows of frames, one for each horizon in [training.horizons]."""
+    """Phases of training on windows of frames, one for each horizon in [training.horizons]."""
     settings = data[0].settings.horizons
     if settings is None:
         return []
@@ -108,7 +108,8 @@ def _mean(error: Callable, trainers: Sequence, held_out: Sequence) -> Callable[[
 
 def take_all_steps(training: Training, guard: Guard, stage: str, section: str, remedy: str,
                    after_each: Callable[[Training], None] = lambda training: None) -> None:
-    """Run a training to its end, from its newest checkpoint if one exists. Log lines begin with `stage`.
+    """Run a training to its end, from its newest checkpoint if one exists. Log lines begin with `stage`; `after_each`
+    is called after each step.
 
     Raises Stopped after a checkpoint if a stop is requested. Raises SceneError, which names the `section` and the
     `remedy`, if the training diverges.

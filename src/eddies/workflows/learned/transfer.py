@@ -61,10 +61,11 @@ def run(scene: Scene, comm: Comm, directory: Path) -> None:
 
 
 def trained_on(source: ModelSource, path: str) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:
-    """The run in which the weights of a source were trained, and the a-priori errors on the flow of that run.
+    """The origin of the weights of a source, and the a-priori errors on the flow of the training.
 
-    The run is `path`, with its Mach number, unless the source itself took its weights from another run. If the
-    source was trained only on ground truths of other runs, `truths` has their Mach numbers, and the errors are None.
+    The origin has `path` and `mach_turbulent` of the run that trained the weights. A source that took its weights from
+    another run stores this origin. If the source was trained only on ground truths of other runs, the origin has their
+    Mach numbers, `truths`, instead of its own, and the errors are None.
     """
     origin = source.provenance
     if "source" in origin:

@@ -23,9 +23,9 @@ from eddies.workflows.ground_truth.truth import GroundTruth
 @contextmanager
 def open_truths(own_file: Path, named: Sequence[Path], tracers: Tracers, comm: Comm,
                 device: torch.device) -> Iterator[tuple[GroundTruth, list[GroundTruth]]]:
-    """Open the ground truth of a run, and the ground truths that are named for training; collective.
+    """Open the ground truth of a run, and the list of ground truths that are named for training; collective.
 
-    If none is named, the run's own ground truth is used for training.
+    If none is named, the list holds the run's own ground truth.
     """
     with ExitStack() as files:
         def opened(path: Path) -> GroundTruth:
@@ -37,9 +37,9 @@ def open_truths(own_file: Path, named: Sequence[Path], tracers: Tracers, comm: C
 
 def truth_problems(settings: Training, tracers: Tracers, reads: Collection[str], own_file: Path,
                    comm: Comm) -> list[str]:
-    """Reasons why [training] truths cannot be used with terms of the inputs `reads`, one line each; all ranks call it.
+    """Reasons why [training] truths cannot be used with terms that read the inputs `reads`; all ranks call it.
 
-    The ground truth of the run itself, `own_file`, is not examined, because it may not exist yet.
+    Each reason is one line. The ground truth of the run itself, `own_file`, is not examined: it may not exist yet.
     """
     own, problems, seen = own_file.resolve(), [], set()
     for name, path in zip(settings.truths or (), settings.truth_files):

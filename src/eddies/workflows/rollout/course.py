@@ -54,8 +54,9 @@ class Course:
     def run(self) -> dict[str, float | str]:
         """Advance to the last frame, or until the state is faulty.
 
-        Returns status, time and number of steps. After at least one step also `time_step` (mean length) and
-        `storing_share` (part of the wall time that storing took), and quartiles of the seconds of timed steps.
+        Returns attributes of the product: `status`, `time` of the last frame, and number of `steps`. After at least one
+        step also the mean `time_step`, and the `storing_share` of the wall time that storing took. After a timed step
+        also those of `quartiles`.
         """
         complaint: str | None = None
         if not self.times:
@@ -79,7 +80,7 @@ class Course:
                 "steps": self.steps, **step, **quartiles(self.seconds)}
 
     def state_dict(self) -> dict[str, Any]:
-        """The state for a checkpoint, besides the files of the frames."""
+        """The state for a checkpoint, without the frames, which have files of their own."""
         return {"rollout": {"clock": self.clock.state_dict(), "energy": self.energy, "ranks": self.comm.size,
                             "seconds": self.seconds, "times": self.times},
                 **self.method.state_dict()}
@@ -89,7 +90,7 @@ class Course:
         state = saved["rollout"]
         self.clock.load_state_dict(state["clock"])
         self.times, self.energy = state["times"], state["energy"]
-        if state["ranks"] == self.comm.size:  # times of another number of ranks are not comparable
+        if state["ranks"] == self.comm.size:  # wall times on another number of ranks differ
             self.seconds = state["seconds"]
 
     def _step(self, until: float) -> str | None:
@@ -124,7 +125,7 @@ class Course:
 
 
 def quartiles(seconds: Sequence[float]) -> dict[str, float]:
-    """Median and quartiles of the seconds of steps; empty without timed steps."""
+    """Median `seconds_per_step` of timed steps, and quartiles `..._low` and `..._high`; empty without timed steps."""
     if not seconds:
         return {}
     low, median, high = np.quantile(seconds, (0.25, 0.5, 0.75))

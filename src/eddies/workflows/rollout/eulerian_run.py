@@ -41,9 +41,9 @@ RUNAWAY_ENERGY = 100.0
 class EulerianRun:
     """A fluid on a coarse grid, with or without a closure, that starts at a frame of the truth.
 
-    It starts from the modes of the unfiltered velocity that the grid holds. They are those of the true flow, or are
-    found from the velocities of the particles. Equations for the filtered velocity start from these modes after the
-    filter. The particles always follow the filtered velocity.
+    The state starts from the modes of the unfiltered velocity that the grid holds. These modes are read from the true
+    flow or found from the velocities of the particles. If the equations are for the filtered velocity, the modes are
+    filtered first. The particles always follow the filtered velocity.
     """
 
     def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:
@@ -82,8 +82,8 @@ class EulerianRun:
         return self.clock.time
 
     def advance(self, until: float, number: int) -> str | None:
-        """Take the first of equal steps that end at the time `until`. Returns on all ranks the fault of the new state,
-        or None.
+        """Divide the time left to `until` into equal steps and take the first one. Returns on all ranks the fault of
+        the new state, or None.
 
         The Courant number of the present flow and [simulation] step limit the step.
         """
@@ -91,7 +91,7 @@ class EulerianRun:
         longest = min(self.step_limit.bound(self.state, self.clock), self.longest_step)
         step = left / math.ceil(left / longest - 1e-9)
         began = time.perf_counter()
-        with np.errstate(over="ignore", invalid="ignore"):  # reported below
+        with np.errstate(over="ignore", invalid="ignore"):  # the condition below reports it
             if self.fluid.closure is not None:
                 self.fluid.closure.begin_step(self.state[:3])
             self.state = self.stepper(self.state, step)
@@ -108,7 +108,8 @@ class EulerianRun:
     def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
         """The particles, with the density of a compressible fluid, and their acceleration (n, 3).
 
-        The acceleration is du/dt + v.grad u of the filtered velocity u at the particles, exact except for the splines.
+        The acceleration is du/dt + v.grad u, with the filtered velocity u and the velocity v of the particle. Its only
+        error is that of the splines.
         """
         density = {"density": self.tracers.density(self.state)} if self.has_density else {}
         fluid, transfer = self.fluid, self.tracers.field.transfer
@@ -147,7 +148,8 @@ class EulerianRun:
         self.tracers = TracerParticles(self.tracers.field, columns, self.state)
 
     def description(self) -> dict[str, float | str]:
-        """Grid, fluid and closure; after a step also `flow_seconds_per_step`, the median time without particles."""
+        """Attributes for the product: grid, fluid and closure. After a step also `flow_seconds_per_step`, the median
+        seconds of a step of the flow, without the particles."""
         grid = self.fluid.grid
         seconds = {"flow_seconds_per_step": float(np.median(self.flow_seconds))} if self.flow_seconds else {}
         key = self.settings.form.constant
@@ -159,10 +161,10 @@ class EulerianRun:
 
 def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float, directory: Path,
                damping: str | None) -> Closure | None:
-    """The closure of the equations for a filtered velocity. With `filter_width` = 0 the filter is the sharp cut-off of
-    the grid at its highest wavenumber k_c, and the length Delta is pi/k_c.
+    """The closure of the equations for a velocity that has passed a filter of this width.
 
-    A learned closure takes the parameter `damping` of the terms in the model.h5 of the directory.
+    If `filter_width` is 0, the filter is the sharp cut-off of the grid at its highest wavenumber k_c, and the length
+    Delta is pi/k_c. `damping` names the parameter in the directory's model.h5 that a learned closure takes.
     """
     def learned() -> Closure:
         _, weights = load_weights(grid.decomposition.comm, directory / STAGES["train"].file, "model")
@@ -182,7 +184,7 @@ def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float, dire
 
 
 def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame: int) -> np.ndarray:
-    """The modes of the true flow at a frame, on the grid of a fluid. The velocity is filtered with `filter_passed`.
+    """The modes of the true flow at a frame, on the grid of a fluid, after a filter of the width `filter_passed`.
 
     The density is read from the frame; a filtered velocity gets a density in balance with it. Raises SceneError if the
     unfiltered flow is not stored at that frame.
@@ -215,8 +217,8 @@ def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame:
 @torch.no_grad()
 def state_of_particles(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame: int) -> np.ndarray:
     """The modes that least squares find in the velocities of the true particles at a frame (`ResolvedVelocity`). The
-    filter of the particles is undone, unless the equations are for the filtered velocity. A density is in balance with
-    the velocity.
+    filter of the particles is undone, unless the equations are for the filtered velocity. A compressible fluid gets a
+    density in balance with the velocity.
 
     Modes beyond those that the particles resolve are zero.
     """

@@ -28,21 +28,22 @@ from eddies.workflows.rollout.particle_measures import (GRADIENT, FieldsOfPartic
 log = logging.getLogger("eddies")
 
 Task = tuple[str, str, int]  # quantity ("spectra", "invariants" or "planes"), "model" or "truth", frame
-#: Measures of true tracers by ground truth, kernel, quantity and frame. The rank that measured one holds its value, the
-#: others hold None.
+#: Measures of true tracers. A key is ground truth, kernel (None for spectra), quantity and frame. The rank that made a
+#: measure holds its value; the other ranks hold None.
 TruthMeasures = dict[tuple[Path, Path | None, str, int], Any]
 
 
 class TrueParticles:
     """The true tracers at the times of a rollout, in single precision like the particles of the rollout.
 
-    The acceleration is the centred difference of the velocity along trajectories. Images count from the first frame.
+    The acceleration is the centred difference of the velocity along trajectories. The column `image` counts how often a
+    particle has left the cube since the first of these times.
 
     Parameters
     ----------
     tracers : the tracers of the ground truth.
-    start_time : start of the rollout. times : times of its frames since then, (m,). Times without a frame of
-        the tracers are left out.
+    start_time : start of the rollout. times : times of its frames since then, (m,). A time is left out if the tracers
+        have no frame at this time, or only their first or last frame.
     """
 
     def __init__(self, tracers: Trajectory, start_time: float, times: np.ndarray) -> None:
@@ -50,12 +51,12 @@ class TrueParticles:
         nearest = np.abs(tracers.times[:, None] - at).argmin(axis=0)
         reached = (np.abs(tracers.times[nearest] - at) < 1e-6) & (0 < nearest) & (nearest < len(tracers.times) - 1)
         self._tracers, self.times, self.total, self.length = tracers, times[reached], tracers.total, tracers.length
-        #: the frames of the ground truth
+        #: the frames of the ground truth at `times`
         self.frames = nearest[reached]
         self.columns = (*tracers.columns, "acceleration")
 
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Read rows start to stop of a column, in order of id. ProductError if a value is not finite."""
+        """Read rows start, ..., stop - 1 of a column, in order of id. ProductError if a value is not finite."""
         tracers, at = self._tracers, int(self.frames[frame])
         if column == "acceleration":
             before, after = (tracers.read(at + step, "velocity", start, stop) for step in (-1, 1))
@@ -84,7 +85,7 @@ class ComputedSeries:
         return self.make(frame)
 
 
-#: The true tracers of a rollout without a ground truth.
+#: A series without frames, in place of the true tracers if there is no ground truth.
 NOTHING = ComputedSeries(np.zeros(0), "velocity", lambda frame: np.zeros((0, 3)))
 
 
@@ -101,7 +102,9 @@ class OnDemand(dict):
 
 
 class MeasuredRollout:
-    """An open rollout on one rank. A measure is made once, when it is first used, or by all ranks with `measure`.
+    """An open rollout on one rank, with its measures: spectra, invariants and planes at single frames.
+
+    Each measure is made once: when it is first used, or before that by all ranks with `measure`.
 
     Parameters
     ----------
@@ -126,7 +129,8 @@ class MeasuredRollout:
 
     @property
     def exported(self) -> dict[str, dict[str, Any]]:
-        """Series of "fields" and "particles" by name; with a kernel, particles have velocity gradients."""
+        """For "fields" and "particles", the series of "model" and "truth" by name. Fields, and velocity gradients of
+        particles, need a kernel."""
         fields, runs = self.fields, self.particles
         if fields is None:
             return {"fields": {}, "particles": runs}
@@ -152,9 +156,9 @@ class MeasuredRollout:
         """Measure a share of the frames on each rank and collect everything on rank `root`; all ranks call it.
 
         page: measure what a page shows, otherwise only what `accuracy` needs. every_frame: for a main page, measure the
-        velocity gradient at all common frames and spectra at several. known: measures of true tracers from earlier
-        calls; new ones are added. Other ranks than `root` keep no measures but those in `known`. ProductError
-        on all ranks if one of them cannot read a frame.
+        velocity gradient at all common frames and spectra at several; otherwise both at the last one. known: measures
+        of true tracers from earlier calls; new ones are added. Ranks other than `root` keep only measures in `known`.
+        ProductError on all ranks if one of them cannot read a frame.
         """
         if self._solver is None:
             return
@@ -182,13 +186,13 @@ class MeasuredRollout:
             log.info("report: %s", complaints[0] + (f" ({len(complaints)} such solves)" if complaints[1:] else ""))
 
     def forget(self) -> None:
-        """Free all measures; one that is used again is made again."""
+        """Free all measures. A measure that is used later is made again."""
         for measures in (self.rollout.spectra, self.rollout.invariants, self.rollout.planes):
             for of_frames in (measures or {}).values():
                 of_frames.clear()
 
     def _tasks(self, page: bool, every_frame: bool) -> list[Task]:
-        """List the measures to make; empty if nothing is compared."""
+        """List the measures to make; empty if model and truth have no common frame."""
         run = self.rollout
         try:
             common = run.common
@@ -220,7 +224,7 @@ class MeasuredRollout:
 def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
     """Open the rollout of a run directory on one rank, with its ground truth and kernel if they are there.
 
-    Raises ProductError if one of them cannot be read.
+    A ground truth that the rollout was not made from is left out. Raises ProductError if a file cannot be read.
     """
     with ExitStack() as files:
         def opened(kind: str) -> Any:

@@ -19,15 +19,15 @@ from eddies.workflows.rollout.particle_run import ParticleRun
 
 
 class Method(Protocol):
-    """Moves the particles of a rollout. Made as Class(scene, truth, start, directory, device), where `start` is the
-    frame of the ground truth at which the rollout starts. All methods are collective.
+    """Moves the particles of a rollout. Class(scene, truth, start, directory, device) makes an instance, where `start`
+    is the frame of the ground truth at which the rollout starts. All methods are collective.
 
     `state_dict` and `load_state_dict` may be missing: a stopped rollout then starts again from the beginning.
     """
 
     has_density: bool  # whether the particles of a frame have a density
 
-    time: float  # of the particles, since the start
+    time: float  # time of the particles since the start of the rollout
 
     def advance(self, until: float, number: int) -> str | None:
         """Take one step, the `number`-th, towards the time `until`. The step may pass that time if `frame` can
@@ -58,16 +58,16 @@ METHODS: dict[str, Callable[..., Method]] = {"learned": ParticleRun, "none": Par
 
 @dataclass(frozen=True)
 class TimeStep:
-    """Integrator and longest time step of a rollout; for a coarse grid "etdrk4" and the Courant number."""
+    """Integrator and longest time step of a rollout. On a coarse grid they are "etdrk4" and the Courant number."""
 
     integrator: str
     size: float
 
 
 def make_method(scene: Scene, step: TimeStep | None, truth: GroundTruth, start: int, directory: Path) -> Method:
-    """The method of a scene, starting at a frame of the truth. A given `step` replaces the scene's step; collective.
+    """Make the method of a scene for a rollout that starts at a frame of the truth; collective.
 
-    With a given step, the step limit of the resolved velocity is ignored.
+    A given `step` replaces the step of the scene. The resolved velocity then does not limit the step.
     """
     settings = scene.simulation
     if step is not None and settings.on_grid:

@@ -18,7 +18,7 @@ from eddies.particles.particle_field import ParticleField
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.resolved_velocity import ResolvedVelocity
 
-MOST_ITERATIONS = 100  # of a solve for a spectrum, see ParticleSpectra
+MOST_ITERATIONS = 100  # in a solve for a spectrum, see ParticleSpectra
 GRADIENT = "velocity_gradient"
 
 
@@ -27,8 +27,8 @@ class FieldsOfParticles:
 
     Parameters
     ----------
-    form : the form of reconstruction. slab : the box on one rank, with as many planes as the grid has cells along a
-        side. Grid point i is at i L / cells.
+    form : the form of reconstruction. slab : the box on one rank; its planes are those of the grid of the fields. Grid
+        point i is at i L / planes.
     """
 
     def __init__(self, form: Form, slab: SlabDecomposition) -> None:
@@ -85,7 +85,7 @@ class WithGradients:
         self.total, self.length, self.columns = particles.total, particles.length, (*particles.columns, GRADIENT)
 
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Read rows start to stop of a column, in order of id."""
+        """Read rows start, ..., stop - 1 of a column, in order of id."""
         if column == GRADIENT:
             return self._fields.gradients(self._particles, frame)[start:stop]
         return self._particles.read(frame, column, start, stop)
@@ -101,21 +101,22 @@ class ReconstructedFields:
         self.cells = fields.slab.planes
 
     def read(self, index: int, variable: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Read planes start to stop, (3, stop - start, y, x)."""
+        """Read planes start, ..., stop - 1, (3, stop - start, y, x)."""
         return self._fields.velocity(self._particles, index)[:, start:stop]
 
 
 class ParticleSpectra:
     """Energy spectra of particles, from the modes that a least-squares fit finds in their velocities.
 
-    These are the modes of the closure's resolved velocity, with the same wavenumbers for all methods. No kernel
-    attenuates them, and the same wavenumbers are missing in model and truth. Every solve starts from 0 and is in
-    single precision, like the stored frames.
+    These modes are those of `ResolvedVelocity`, as in the closures of the particle model. No kernel attenuates them.
+    Their wavenumbers are the same for all methods, for model and for truth. Every solve starts from 0 and is in single
+    precision, like the stored frames.
 
-    Particles without a force between them cluster and leave voids, where only the weak prior determines the modes.
-    The equations become stiff: without a force for T/2 a solve takes 167 iterations in `hit` and 121 in `hit-coarse`
-    instead of 44. Iterations after the first 100 change ln E(k) by 0.07 at most, while such spectra have twice the
-    energy of the true ones. A solve therefore ends after 100 iterations, and is listed in `complaints`.
+    Particles without a force between them cluster and leave voids, where only the weak prior determines the modes. The
+    equations become ill-conditioned: after T/2 without a force, a solve takes 167 iterations in the scene `hit` and 121
+    in `hit-coarse`, instead of 44. Iterations after the first 100 change ln E(k) by 0.07 at most. This is little, since
+    such spectra have twice the true energy. A solve therefore ends after 100 iterations; if it has not converged,
+    `complaints` lists it.
 
     Parameters
     ----------
@@ -128,7 +129,7 @@ class ParticleSpectra:
 
     @cached_property
     def _resolution(self) -> ResolvedVelocity:
-        cells = max(2 * round(0.875 * self.length / self.scales.spacing), 3)  # as `Tracers.planes`; 3 for the splines
+        cells = max(2 * round(0.875 * self.length / self.scales.spacing), 3)  # as `Tracers.planes`; splines need 3
         found = ResolvedVelocity.on_slabs(SlabDecomposition(self.alone, self.length, cells), self.scales,
                                           dtype=torch.float32)
         found.most_iterations = MOST_ITERATIONS
@@ -139,7 +140,8 @@ class ParticleSpectra:
         self.__dict__.pop("_resolution", None)
 
     def of(self, particles: Frames, frame: int, whose: str) -> np.ndarray:
-        """E(k) of the shells 0, 1, ... whose modes are all resolved, at least of two. `whose` names the particles."""
+        """E(k) of the shells 0, 1, ... in which all modes are resolved, and of shell 1 in any case. `whose` names the
+        particles in `complaints`."""
         position, velocity = (particles.read(frame, name).astype(float) for name in ("position", "velocity"))
         with torch.no_grad():
             flow = self._resolution.of(ParticleSet.from_numpy(

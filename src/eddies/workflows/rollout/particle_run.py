@@ -33,10 +33,10 @@ from eddies.workflows.rollout.saved_particles import particle_state, restored_pa
 
 log = logging.getLogger("eddies")
 
-# A state is faulty if a particle is this many times faster than the rms of the truth, or if its density deviates from
-# the mean by this many rms of the truth and by more than the mean itself.
+# A state is faulty if the speed of a particle exceeds RUNAWAY_SPEED times the rms velocity of the truth, or if its
+# density deviates from the mean by more than the mean itself and by more than RUNAWAY_DENSITY times the true rms.
 RUNAWAY_SPEED, RUNAWAY_DENSITY = 30.0, 300.0
-# Columns that are stored about the solves for the resolved velocity.
+# Columns of the table on the solves for the resolved velocity; see `ParticleRun.series`.
 SOLVES = "solves", "iterations", "most_iterations", "residual", "not_converged"
 
 
@@ -85,7 +85,7 @@ class ParticleRun:
         """Take one step towards the time `until`. Returns on all ranks the fault of the new state, or None.
 
         The step is as long as the scene allows, or shorter if the flow demands it. A scheme with dense output may step
-        beyond `until`. Steps of other schemes end there.
+        beyond `until`. Other schemes divide the time left to `until` into equal steps.
         """
         step, left = min(self.settings.longest_step, self._allowed_step()), until - self.time
         if not self.integrator.scheme.dense:
@@ -102,7 +102,7 @@ class ParticleRun:
         return complaint
 
     def _allowed_step(self) -> float:
-        """The longest step that the resolved velocity allows in the present flow; infinite without one."""
+        """The longest step that the resolved velocity allows in the present flow; infinite if it sets no limit."""
         resolution = self.dynamics.resolution
         if resolution is None or not self.limited:
             return np.inf
@@ -133,7 +133,7 @@ class ParticleRun:
         return particles, rates.acceleration
 
     def _now(self) -> Moment:
-        """The particles with their rates, which the next step uses again; collective."""
+        """The present particles and their rates. The next step reuses these rates. Collective."""
         self.particles, rates = self.integrator.rates(self.particles)
         return Moment.of(self.comm, self.total, self.time, self.particles, rates)
 
@@ -159,11 +159,11 @@ class ParticleRun:
         return f"  iterations {means[-1]:.1f}" if means else ""
 
     def series(self) -> dict[str, dict[str, list[float]]]:
-        """Tables over the frames.
+        """Tables with a row for each frame.
 
-        `outside_training`: share of pairs whose network inputs are outside the range of the training.
-        `closure`: since the last frame the number of solves for the resolved velocity, their iterations in total and at
-        most, the largest residual, and the number of solves that did not converge.
+        `outside_training`: `share` of the pairs whose network inputs are outside the range of the training.
+        `closure`: columns SOLVES on the solves for the resolved velocity since the last frame: number of solves, sum of
+        their iterations, most iterations of one solve, largest residual, number of solves that did not converge.
         """
         tables = {} if self.seen is None else {"outside_training": {"share": self._shares_outside}}
         return tables if self.dynamics.resolution is None else {**tables, "closure": self._solves}
@@ -187,8 +187,9 @@ class ParticleRun:
 def forcing_of(power: str | float, section: ForcingSection | None, truth: GroundTruth) -> Forcing | None:
     """The forcing of a rollout, None without one.
 
-    `power` is [simulation] injection: "truth" means the forcing of the ground truth, "dissipation" its dissipation
-    rate, a number the power per mass, "none" no forcing. Rates and numbers act at the wavenumbers of `section`.
+    `power` is [simulation] injection: "truth" means the forcing of the ground truth, "dissipation" a power equal to its
+    dissipation rate, a number the power per mass, "none" no forcing. `section` is [forcing] of the scene: for
+    "dissipation" and numbers it sets the limit of the forced wavenumbers, which is 2 without it.
     """
     if power == "truth":
         return truth.forcing

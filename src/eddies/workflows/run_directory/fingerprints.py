@@ -21,10 +21,10 @@ DURATION_KEYS = {"dns": ("tracers.turnovers", "time.duration")}
 
 
 def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> str:
-    """Return the SHA-256 of the inputs of a stage's product, `without` some keys, such as the stage's DURATION_KEYS.
+    """Return the SHA-256 of the inputs of a stage's product. `without` names keys to leave out, such as DURATION_KEYS.
 
-    It covers the settings of the stage and of the scene's earlier stages, the content of the files that the flow, the
-    weights and the step come from, the source of the user's classes, and the fingerprints of other ground truths.
+    It covers the settings of the stage and of those it depends on, the content of the files that the flow, the weights
+    and the step come from, the source of the user's classes, and the fingerprints of other ground truths.
     """
     training, simulation = scene.training, scene.simulation
     settings: dict[str, Any] = asdict(scene) | {
@@ -33,7 +33,7 @@ def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> 
         "truths": _fingerprints(training.truth_files if training else ()),
         "found_step": _digest(simulation.step_file if simulation else None),
         "confirming": _fingerprints(simulation.confirming_files if simulation else ())}
-    if scene.sets:  # SET_KEYS are the keys of each set; all sets share the others
+    if scene.sets:  # each set has its own SET_KEYS; all sets share the other keys
         sets = settings["tracers"].pop("sets")
         settings["tracers"] = {key: value for key, value in settings["tracers"].items() if key not in SET_KEYS} | {
             "sets": {name: {key: sets[name][key] for key in SET_KEYS} for name in sorted(sets)}}
@@ -54,7 +54,7 @@ def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> 
 
 
 def set_files(scene: Scene) -> dict[Path, str]:
-    """Return the ground truths of the sets of tracers, relative to the run directory, each with its fingerprint."""
+    """Return the fingerprint of each tracer set's ground truth, by the file's path relative to the run directory."""
     return {Path(name) / STAGES["dns"].file: stage_fingerprint(own, "dns") for name, own in scene.tracer_sets.items()}
 
 
@@ -74,7 +74,7 @@ def _without(value: Any, section: str, keys: Sequence[str]) -> Any:
 
 
 def _fingerprints(paths: Sequence[Path]) -> list[str | None]:
-    """The fingerprints of ground truths, whose files may be too large to digest; None for a missing one."""
+    """The stored fingerprints of ground truths; None for a missing one. The files may be too large to digest."""
     if not paths:
         return []
     from eddies.io.provenance import product_fingerprint  # imports h5py and mpi4py

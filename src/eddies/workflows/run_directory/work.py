@@ -1,5 +1,5 @@
-"""The work that a run directory holds. Work that fits the scene's settings is kept or continued; other work would be
-replaced."""
+"""The work that a run directory holds: products and checkpoints. Work that fits the scene's settings is kept or
+continued; other work would be replaced."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, set_files
 
 SECONDS = "stage_seconds.json"
 FAILURE = "failure.txt"  # the error of a failed variant
-MOST_CHANGES = 3  # in the message of a refusal
+MOST_CHANGES = 3  # largest number of changed settings that a message names
 
 
 class WouldReplaceWork(UserError):
@@ -44,7 +44,7 @@ class Work:
     done: frozenset[str]  # stages whose product is complete and was made with the same settings
     begun: frozenset[str]  # stages that continue from a checkpoint
     obsolete: frozenset[str]  # stages whose checkpoints are left over from a complete run, or belong to other settings
-    lost: tuple[str, ...]  # the files that the stages would replace, with their cost
+    lost: tuple[str, ...]  # the files that the stages would replace, each with its wall time or date
     changes: tuple[str, ...]  # the settings that differ from those of the lost files
 
     def refuse_to_lose(self) -> None:
@@ -74,7 +74,7 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
         of_sets = {path: product_provenance(directory / path) for path in sets}
         if complete and all(of_sets[path].get("fingerprint") == fingerprint for path, fingerprint in sets.items()):
             done.add(stage.name)
-            # Work of other settings may still be continued, and a direct simulation may go on for longer.
+            # Checkpoints of other settings can still be continued, and those of a direct simulation serve a longer one.
             if not of_others and stage.name != "dns":
                 obsolete.add(stage.name)
             continue
@@ -84,7 +84,7 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
                 changes |= dict.fromkeys(changed_settings(stage, of_sets[path].get("scene"), scene.to_toml()))
         same_course = checkpoints and not of_others and origin.get("course") == continued and stage.name not in links
         if same_course and origin["duration"] > scene.duration:
-            obsolete.add(stage.name)  # the checkpoint is too late
+            obsolete.add(stage.name)  # the checkpoint may lie after the end of the shorter run
         elif same_course:
             begun.add(stage.name)
             continue
@@ -98,7 +98,7 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
         if of_others:
             obsolete.add(stage.name)
             if origin.get("course") in [fingerprint for _, fingerprint in checkpoints]:
-                continue  # the last state of the product, which `lost` has already
+                continue  # it holds the last state of the product, which is already in `lost`
             seconds_so_far = seconds.get(stage.name)
             cost = "" if seconds_so_far is None else f", took {duration(seconds_so_far)}"
             lost.append(f"{stage.checkpoints} (step {checkpoints[0][0]}{cost})")
@@ -115,15 +115,15 @@ def _scene_of(directory: Path) -> str | None:
 
 
 def step_path(settings: Simulation, directory: Path) -> Path | None:
-    """The file of the step that a rollout takes: of its run directory or of [simulation] step_from; None if the step is
-    a number."""
+    """The file with the step of a rollout, in its run directory or in that of [simulation] step_from; None if the step
+    is a number."""
     if settings.step != CONVERGED:
         return None
     return settings.step_file or directory / STAGES["find-step"].file
 
 
 def read_found_step(path: Path, comm: Comm) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The attributes of a found step, and the trials with its integrator; all ranks call it."""
+    """The attributes of a found step, and the table of the trials with the same integrator; all ranks call it."""
     with open_product(comm, path, "step") as file:
         found = read_attributes(file, "found")
         return found, read_table(file, f"trials/{found['integrator']}")
@@ -149,8 +149,8 @@ def read_stage_seconds(directory: Path) -> dict[str, float]:
 
 
 def changed_settings(stage: Stage, then: str | None, now: str | None) -> list[str]:
-    """The settings of a stage's product that differ between the texts of two scenes, each with both values; empty if a
-    text is missing or damaged."""
+    """The settings of a stage's product that differ between two scenes, as text with both values. `then` and `now` are
+    the scenes as TOML; the list is empty if one of them is missing or damaged."""
     stages = [STAGES[name] for name in (*stage.depends_on, stage.name)]
     try:
         before, after = (dict(dotted(tomllib.loads(text or ""))) for text in (then, now))
