@@ -102,8 +102,8 @@ BAD_OVERRIDES = [
     ("spin_up.stationary=1", "[spin_up] stationary = 1: must be less than turnovers = 1"),
     ("time.duration=3", "[time] duration = 3: with [tracers] the run time is [tracers] turnovers"),
     ("tracers.field_cells=32", "[tracers] field_cells = 32: must be at most [flow] cells = 24"),
-    ("kernel.neighbors=2000", "half the cube is 3.14; lower neighbors or raise [tracers] particles_per_side"),
-    ("model.neighbors=2000", "[model] neighbors = 2000: with 1728 particles the radius and skin are 4.5"),
+    ("kernel.neighbors=2000", "half the cube, 3.14; lower neighbors or raise [tracers] particles_per_side"),
+    ("model.neighbors=2000", "[model] neighbors = 2000: with 1728 particles radius and skin together are 4.5"),
     ('model.terms=["pressure", "continuity"]', '"continuity" gives its rate, so it is given twice'),
     ('model.terms=["pairs"]', '"pairs" reads the density, which no term gives'),
     ("training.window=1", "[simulation] start: this key is missing"),
@@ -140,11 +140,11 @@ INFEASIBLE = [
     ("simulation.step=1e-12", "[simulation] step = 1e-12: 3.5e+11 steps"),
     ("simulation.turnovers=1e12", "[simulation] step = 0.08: 1.5e+13 steps of 0.08 for a time of 1.16e+12"),
     ("simulation.frame_interval=2.0", "[tracers] turnovers = 0.6 is expected to give at most 106 frames: "
-     "[simulation] start: from frame 52 of 106 on, no frame has a filtered field and one more frame"),
-    ("simulation.start=0.99", "[simulation] start: from frame 103 of 106 on, no frame has a filtered field"),
+     "[simulation] start: the rollout needs a frame with a filtered field and one more frame"),
+    ("simulation.start=0.99", "[simulation] start: the rollout needs a frame with a filtered field"),
     ("tracers.field_every=500", "[tracers] field_every: no filtered field is stored between the first and the last"),
-    ("tracers.turnovers=0.01", "[training] window = 0.5: holds 2 frames of the ground truth, too few with 2 held out"),
-    ("training.window=0.01", "[training] window = 0.01: holds 2 frames of the ground truth, too few with 2 held out "
-     "for validation and horizons of 0; raise it or [tracers] turnovers, or lower"),
-    ("training.horizons={steps = 1, frames = [50]}", "50 held out for validation and horizons of 50; raise it or"),
+    ("tracers.turnovers=0.01", "[training] window = 0.5: holds 2 frames; too few remain for training"),
+    ("training.window=0.01", "[training] window = 0.01: holds 2 frames; too few remain for training, "
+     "because 2 are for validation, and the longest horizon takes 0; raise window or [tracers] turnovers, or lower"),
+    ("training.horizons={steps = 1, frames = [50]}", "because 50 are for validation, and the longest horizon takes 50; raise window or"),
 ]

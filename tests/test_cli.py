@@ -85,7 +85,7 @@ def test_a_command_that_cannot_work_writes_nothing(comm, tmp_path, capfd, argume
 @pytest.mark.mpi(3)
 def test_a_skin_that_reaches_beyond_the_slabs_is_refused(comm, tmp_path, capfd):
     assert run_cli("simulate", TINY, "--set", "simulation.skin=1", "--output", tmp_path / "run") == 2
-    assert one_line(comm, capfd, "slabs no thinner than the particles' reach") and not (tmp_path / "run").exists()
+    assert one_line(comm, capfd, "slabs, at least as thick as the particles' reach") and not (tmp_path / "run").exists()
 
 
 @pytest.mark.mpi(2)
@@ -175,7 +175,7 @@ def test_input_of_other_settings_is_refused(comm, tmp_path, capfd):
         pass
     check_inputs(Step(scene, ("train-kernel",), tmp_path), comm)
     assert run_cli("train-kernel", TINY, "--set", "seed=2", "--output", tmp_path) == 2
-    assert one_line(comm, capfd, "ground_truth.h5: was made with other settings")
+    assert one_line(comm, capfd, "ground_truth.h5: was made with settings that differ")
     assert not (tmp_path / "kernel.h5").exists() and not (tmp_path / "scene.toml").exists()
 
 

@@ -57,7 +57,8 @@ def build_parser() -> argparse.ArgumentParser:
         add_job_options(command, "run directory (default: runs/NAME)")
     report = add_command(commands, "report", STAGES["report"].about)
     add_run(report, "run")
-    add_variants(report, "show the first of these that was run, after the table of all variants; repeatable")
+    add_variants(report, "show this variant after the table of all variants; if given several times, the first one "
+                         "that was run")
     add_log_options(report)
     report.add_argument("--output", type=directory, metavar="DIR",
                         help="write the page there instead of RUN/report, for example if RUN is read-only")
@@ -76,7 +77,8 @@ def build_parser() -> argparse.ArgumentParser:
     how.add_argument("--json", action="store_true", help="the numbers as JSON, for programs")
     how.add_argument("--time", action="store_true", help="run a few steps of each stage, and estimate its time")
     scenes = add_command(commands, "scenes", "the built-in scenes, one per line; or one scene with all settings")
-    scenes.add_argument("scene", nargs="?", metavar="SCENE", help="print this scene with all keys, also absent ones")
+    scenes.add_argument("scene", nargs="?", metavar="SCENE",
+                        help="print this scene with all possible keys; absent ones are comments")
     scenes.add_argument("--schema", action="store_true", help="print the JSON schema of scenes, for editors")
     status = add_command(commands, "status", "the state of run directories: stages, checkpoints, jobs, sizes")
     status.add_argument("directory", nargs="?", type=directory, default=Path("runs"), metavar="DIR",
@@ -85,7 +87,7 @@ def build_parser() -> argparse.ArgumentParser:
     diff = add_command(commands, "diff", "the differences between two runs: settings and numbers")
     add_run(diff, "one")
     add_run(diff, "other", nargs="?")
-    add_variants(diff, "compare this variant of both runs; given twice, two variants of one run")
+    add_variants(diff, "compare this variant of both runs or, if given twice, two variants of one run")
     return parser
 
 

@@ -115,7 +115,7 @@ def run_steps(planned: Sequence[Step], comm: Comm, directory: Path, stop: StopRe
         if step.variant in failures:
             continue
         if len(planned) > 1:
-            log.info("%s, %d of %d: %s", step.directory, number, len(planned), ", ".join(step.stages))
+            log.info("%s, part %d of %d: %s", step.directory, number, len(planned), ", ".join(step.stages))
         holding: AbstractContextManager[None] = nullcontext()
         if step.directory != directory:
             holding = working_in(comm, step.directory, stop, take_over)
@@ -219,9 +219,9 @@ def check_inputs(step: Step, comm: Comm, made: Collection[Path] = ()) -> None:
             pass
         made_with = on_first_rank(comm, partial(product_fingerprint, holder / needed.file))
         if made_with != stage_fingerprint(scene, needed.name):
-            raise SceneError(f"{holder / needed.file}: was made with other settings than this scene's; run "
-                             f"`eddies {needed.name} --overwrite` with these, or give `eddies {stages[0]}` the "
-                             "--set options of that run")
+            raise SceneError(f"{holder / needed.file}: was made with settings that differ from this scene's; run "
+                             f"`eddies {needed.name} SCENE --overwrite`, or give `eddies {stages[0]}` the --set "
+                             "options with which the file was made")
 
 
 def prepare_directory(text: str, comm: Comm, directory: Path) -> None:

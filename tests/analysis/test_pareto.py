@@ -33,7 +33,8 @@ def test_a_method_is_worth_its_cost_where_no_cheaper_one_is_as_accurate():
     assert "early error; late error" in worth and "error" not in not_worth
     worth, not_worth = verdict_on(row("learned", 2, None, None))
     assert "error" not in worth and "no number for early error; late error" in not_worth
-    assert verdict_on(row("learned", 4, 0.3, 0.1))[0].endswith("in no measure.")  # the grid has equal cost and errors
+    # The grid has equal cost and errors.
+    assert verdict_on(row("learned", 4, 0.3, 0.1))[0].endswith("not worth its cost in any measure.")
     assert len(verdict_on(row("learned", 2, 0.1, 0.2), [])) == 1
 
 
@@ -55,8 +56,8 @@ def test_the_cheapest_grid_is_as_accurate_at_every_time():
         return cheapest_grid(model, grids, "seconds", times)
 
     for model in (learned, learned | {"early_spread": 1.0, "late_spread": 1.0}):
-        assert "grid-48, at 0.5 of" in sentence(model)
-    assert "short, at 0.5 of" in sentence(row("learned", 2, 0.1, None), times={"early": "T/2"})
+        assert "grid-48; it costs 0.5 times" in sentence(model)
+    assert "short; it costs 0.5 times" in sentence(row("learned", 2, 0.1, None), times={"early": "T/2"})
     assert sentence(learned, grids[:1]).startswith("No grid")
     for model in (row("learned", 8, None, 0.2), row("learned", None, 0.1, 0.2)):
         assert sentence(model) == ""

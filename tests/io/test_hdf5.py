@@ -32,7 +32,7 @@ def test_table_attributes_and_provenance(comm, tmp_path):
         assert np.array_equal(table["time"], [0, 1, 2]) and table["nothing"].shape == (0, 2)
         assert read_attributes(file, "reference") == {"length": 0.5, "name": "x"}
         origin = read_provenance(file)
-        with pytest.raises(ProductError, match="a.h5: holds no spectra; / holds: reference, statistics"):
+        with pytest.raises(ProductError, match="a.h5: holds no spectra; its group / holds reference, statistics"):
             read_table(file, "spectra")
     assert origin["ranks"] == comm.size and origin["scene"] == "[flow]"
     assert product_fingerprint(path) == "abc"

@@ -141,7 +141,7 @@ def test_an_own_term_has_keys_of_its_own(tmp_path, own):
     ("class Bad(Term):\n    class Settings: pass\n", "its Settings must be a dataclass derived"),
     ("class Bad(Term):\n    class Settings(TermSettings):\n        a: float = 1\n", "write @dataclass(frozen=True)"),
     ("class Bad(Term):\n    @dataclass(frozen=True)\n    class Settings(TermSettings):\n        a: complex = 1j\n",
-     "Bad.Settings.a: complex: declare the key by number, integer"),
+     "Bad.Settings.a: complex: declare the key by a function"),
     ("class Bad(Term):\n    @dataclass(frozen=True)\n    class Settings(TermSettings):\n"
      "        reads = ('vorticity',)\n", 'reads = ["vorticity"]: must be a tuple of any of "pairs", "resolved", '),
     ("class Bad: pass\n", "must be a class derived from eddies.Term"),

@@ -107,7 +107,7 @@ def test_coarse_grid_of_the_filter():
 
 @pytest.mark.parametrize("overrides, message", [
     (["eulerian.cells=50"], "[eulerian] cells = 50: must be at most [flow] cells = 24"),
-    (["eulerian.closure=learned", 'model.terms=["pressure", "stress"]'], '[eulerian] closure = "learned": takes'),
+    (["eulerian.closure=learned", 'model.terms=["pressure", "stress"]'], '[eulerian] closure = "learned": needs'),
     (["eulerian.fluid=compressible", "flow.fluid=incompressible", "flow.sound_speed=none", "model.preset=resolved"],
      '[eulerian] fluid = "compressible": [flow] fluid is incompressible')])
 def test_coarse_grids_that_are_refused(overrides, message):

@@ -153,6 +153,6 @@ def test_without_a_converged_step_or_with_other_particles_there_is_no_step(comm,
     with pytest.raises(SceneError, match="confirmed_on: .*ground_truth.h5 holds 343 particles, not 216"):
         find_step.run(searched(small_products[0], confirmed_on=(str(directory / "more"),)), comm, directory)
     interval = 1000 * small_products[0].tracers.frame_interval
-    with pytest.raises(SceneError, match="the search for the step needs this interval"):
+    with pytest.raises(SceneError, match="the search for the step needs one such interval"):
         find_step.run(searched(small_products[0], frame_interval=interval), comm, directory)
     assert not (directory / "step.h5").exists()

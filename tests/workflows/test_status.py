@@ -108,10 +108,10 @@ def test_damaged_products_are_found(comm, tmp_path, capfd):
         output, errors = capfd.readouterr()
         return [line for line in output.splitlines() if line.startswith(f"{tmp_path}/")], errors
 
-    rest = [f"{tmp_path / 'ground_truth.h5'}: as written",
+    rest = [f"{tmp_path / 'ground_truth.h5'}: unchanged since it was written",
             f"{tmp_path / 'kernel.h5'}: has no checksums, because an earlier version made it"]
     lines, _ = verified(0)
-    assert lines == ([f"{tmp_path / 'a/rollout.h5'}: as written", *rest] if comm.rank == 0 else [])
+    assert lines == ([f"{tmp_path / 'a/rollout.h5'}: unchanged since it was written", *rest] if comm.rank == 0 else [])
     comm.Barrier()
     if comm.rank == 0:
         with h5py.File(tmp_path / "a/rollout.h5") as file:

@@ -210,11 +210,11 @@ def test_wrong_variants_are_refused(tmp_path):
         load_scene(with_variants(tmp_path, few="few"), [*SPLIT, *SETS])
     path = with_variants(tmp_path, a="few")
     path.write_text(path.read_text().replace('tracers.set = "few"', "seed = 4"))
-    with pytest.raises(SceneError, match=r'"a": needs one set of tracers; set variant.a.tracers.set, or \[tracers\]'):
+    with pytest.raises(SceneError, match=r'"a": works on one set of tracers; choose it by the key variant.a.tracers.set, or'):
         load_scene(path, [*SPLIT, *SETS])
 
 
 @pytest.mark.mpi(1)
 def test_other_stages_need_one_set():
-    with pytest.raises(SceneError, match="`eddies train` needs one set of tracers; set .* to one of few, whole"):
+    with pytest.raises(SceneError, match="`eddies train` works on one set of tracers; .*: few, whole"):
         load_scene(TINY, [*SPLIT, *SETS]).check_stages(["train"])

@@ -277,7 +277,7 @@ def test_realisations_that_no_training_has_seen(comm, folder, monkeypatch):
     weights = [load_weights(alone, path, "model")[1] for path in out.glob("**/model.h5")]
     assert all(np.array_equal(one[name], values) for one in weights for name, values in weights[0].items())
     record, rows = rows_of(out)
-    (summary,) = (sentence for sentence in record["summary"] if "keeps the velocity error after" in sentence)
+    (summary,) = (sentence for sentence in record["summary"] if "the velocity error of" in sentence)
     assert summary in (out / "report/index.html").read_text() and rows["grid"]["method"] == "eulerian"
     assert rows["learned"]["training_seconds"] > 0 and rows["grid"]["training_seconds"] is None
     for name, row in rows.items():

@@ -51,11 +51,11 @@ def verdict(model: Method, others: Sequence[Method], cost: str, measures: Mappin
             beaten.append(f"{short}: {rivals[0]['label']}" + (f" and {len(rivals) - 1} more" if rivals[1:] else ""))
         else:
             worth.append(short)
-    found = [f"Methods as accurate as {name} and no slower (only the cheapest is named): {'; '.join(beaten)}."
-             ] if beaten else []
+    found = [f"Methods that are as accurate as {name} and cost no more (only the cheapest is named): "
+             f"{'; '.join(beaten)}."] if beaten else []
     found += [f"{name} has no number for {'; '.join(unknown)}."] if unknown else []
-    return [f"{name} is worth its cost in {'; '.join(worth)}." if worth else f"{name} is worth its cost in no measure.",
-            " ".join(found) or "No other method is as accurate and no slower in any measure."]
+    return [f"{name} is {'' if worth else 'not '}worth its cost in {'; '.join(worth) or 'any measure'}.",
+            " ".join(found) or "In every measure all other methods are slower or less accurate."]
 
 
 def cheapest_grid(model: Method, grids: Sequence[Method], cost: str, times: Mapping[str, str]) -> str:
@@ -66,13 +66,13 @@ def cheapest_grid(model: Method, grids: Sequence[Method], cost: str, times: Mapp
     """
     if not times or None in [model[key] for key in (cost, *times)]:
         return ""
-    limit = f"keeps the velocity error after {' and '.join(times.values())} at or below the error of {model['label']}"
+    limit = f"has at most the velocity error of {model['label']} after {' and '.join(times.values())}"
     kept = [row for row in grids if None not in [row[key] for key in (cost, *times)]
             and all(row[key] <= model[key] for key in times)]
     if not kept:
         return f"No grid {limit}."
     best = min(kept, key=lambda row: row[cost])
-    return f"The cheapest grid that {limit} is {best['label']}, at {best[cost] / model[cost]:.2g} of the cost."
+    return f"The cheapest grid that {limit} is {best['label']}; it costs {best[cost] / model[cost]:.2g} times as much."
 
 
 def break_even(first: float, each: float, rival_first: float, rival_each: float) -> float:

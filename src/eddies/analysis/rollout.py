@@ -42,7 +42,7 @@ class CommonFrames:
         same = gap <= 1e-6 * max(1.0, np.ptp(model.times))
         rows, columns = np.nonzero(same & (model.times < until)[:, None])
         if rows.size == 0:
-            raise ValueError("model and truth have no finite frame at a common time")
+            raise ValueError("there is no time at which model and truth both have finite values")
         return cls(rows, columns, model.times[rows])
 
     def spread(self, count: int) -> np.ndarray:

@@ -151,7 +151,7 @@ class StabilityWatch:
         if not energy <= GROWTH * self._ceiling < math.inf:
             seen = "its energy is no longer finite"
             if math.isfinite(energy):
-                seen = f"its energy is {energy:.3g}, but only {self._ceiling:.3g} was available"
+                seen = f"its energy is {energy:.3g}, but the flow had only {self._ceiling:.3g}"
             raise FlowDiverged(seen, clock, self._advice(before, step))
         self._ceiling = min(self._ceiling, energy)
 

@@ -136,8 +136,8 @@ class CheckpointDirectory:
             paths.pop(0)
         newest = Checkpoint(paths[0]) if paths else None
         if newest is not None and self.comm.rank == 0 and newest.content["computed_by"] != _computed_by():
-            log.warning("the checkpoint was made with %s, but this run has %s: the run continues, but not bit for bit",
-                        newest.content["computed_by"], _computed_by())
+            log.warning("the checkpoint was made with %s, but this run has %s; the run continues, and the last digits "
+                        "of results may differ", newest.content["computed_by"], _computed_by())
         kept = {path.name for path in paths}.union(() if newest is None else newest.files)
 
         def clean() -> None:

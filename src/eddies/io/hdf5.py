@@ -109,7 +109,8 @@ def find_group(file: h5py.Group, name: str) -> h5py.Group:
     """The group `name`. If there is no such group, ProductError, which lists what there is."""
     group = file.get(name)
     if not isinstance(group, h5py.Group):
-        raise ProductError(f"{file.file.filename}: holds no {name}; {file.name} holds: {', '.join(file) or 'nothing'}")
+        raise ProductError(f"{file.file.filename}: holds no {name}; its group {file.name} holds "
+                           f"{', '.join(file) or 'nothing'}")
     return group
 
 

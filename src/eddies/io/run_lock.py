@@ -199,8 +199,8 @@ def find_lock(directory: Path) -> FoundLock | None:
 def _refuse(directory: Path, found: FoundLock | None) -> None:
     if found is not None and not found.stale:
         raise RunInUse(f"{directory}: another job works here ({found.holder}; its last sign of life was "
-                       f"{duration(max(found.silent, 0))} ago); wait until it ends, stop it by a file STOP there, or "
-                       "choose another --output; if the job has died, add --take-over")
+                       f"{duration(max(found.silent, 0))} ago); wait until it ends, make a file STOP in the "
+                       "directory to stop it, or choose another --output; if the job has died, add --take-over")
 
 
 def _take(directory: Path, take_over: bool) -> RunLock:

@@ -169,7 +169,8 @@ def _layout_of(path: Path) -> str:
         return "npz"
     if suffix in (".csv", ".txt", ".dat", ".tsv"):
         return "csv"
-    raise ProductError(f"{path}: the suffix does not show the layout; give layout, one of {', '.join(LAYOUTS)}")
+    raise ProductError(f"{path}: the suffix does not show the layout; give the format (in Python: layout), one of "
+                       f"{', '.join(LAYOUTS)}")
 
 
 def _read_h5md(path: Path, group: str | None, interval: float | None) -> Tracks:

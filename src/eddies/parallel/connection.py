@@ -39,7 +39,7 @@ def require_connected(world: MPI.Comm) -> None:
         remedy = f"with `srun --mpi=pmix`, or another type that {library} and `srun --mpi=list` both have"
     raise NotConnected(
         f"{os.environ[size]} ranks were started ({size}), but MPI connects {world.size} of them; start them {remedy}; "
-        f"for a program without a launcher, unset {size}", os.environ.get(LAUNCHERS[size], "0") == "0")
+        f"if no launcher was used, unset {size}", os.environ.get(LAUNCHERS[size], "0") == "0")
 
 
 def all_arrive(comm: MPI.Comm) -> bool:

@@ -31,7 +31,7 @@ PAIR_VALUES_TOGETHER = {"cpu": 1 << 19, "cuda": 1 << 26}
 # This fraction of the values for evenly spread neighbours is added to moment matrices and sums of weights. They can
 # then be inverted even without neighbours or with only coplanar ones. In all other cases the bias is 0.1 %.
 REGULARISATION = 1e-3
-UNDECLARED = 'no term of this model reads "{}": add it to the `reads` of the settings'
+UNDECLARED = 'the term uses "{}", which no term of this model declares; add it to `reads` of its settings'
 
 
 class PairSum:

@@ -152,7 +152,7 @@ def farthest_outside(slab: SlabDecomposition, particles: ParticleSet) -> float:
     farthest = float(global_max(slab.comm, float(distance.max()) if len(distance) else 0.0))
     if farthest > slab.length:
         complaint = find_unplaced(particles, distance, PeriodicBox(slab.length), slab.comm.rank)
-        raise HaloError(f"within the step, {first_complaint(slab.comm, complaint)}")
+        raise HaloError(f"in an intermediate stage, {first_complaint(slab.comm, complaint)}")
     return farthest
 
 

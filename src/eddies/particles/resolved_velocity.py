@@ -197,8 +197,8 @@ class ResolvedVelocity:
         """
         reach = self.grid.reach
         if farthest_outside(self.grid.decomposition, particles) >= reach:
-            raise HaloError(f"a particle is more than {reach:.3g} outside its slab, beyond the ghost planes, "
-                            "before it can change rank: shorten the time step or the skin")
+            raise HaloError(f"a particle is more than {reach:.3g} outside the slab of its rank, where the "
+                            "ghost planes end; shorten the time step or the skin")
         comm = self.grid.decomposition.comm
         mean = mean_over_ranks(comm, particles.velocity)
         relative, points = particles.velocity - mean, self.grid.points(particles.position)

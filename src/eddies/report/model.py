@@ -52,7 +52,7 @@ def section(description: Mapping[str, Any], table: Table, acceleration: Table, d
                for key, (column, label) in METRICS.items()]
     since, trained = "training window", ""
     if source is not None:
-        since = "release of the tracers, or the training window"
+        since = "release of the tracers, or after the training window on the flow of the training"
     if others:
         whose = "this flow" if source is None else f"the flow of {source}, where its weights come from"
         trained = f" Trained on {', '.join(others)}, and not on {whose}."

@@ -71,7 +71,7 @@ def section(run: Rollout, main: bool = True) -> Section:
         _add_planes(shown, run, main)
         _add_invariants(shown, run, main)
     else:
-        shown.metrics += [Metric(key, key.replace("_", " "), None, WITHOUT_KERNEL) for key in ("qr_kl", "qr_kl_floor")]
+        shown.metrics += [Metric(key, MEASURES[key], None, WITHOUT_KERNEL) for key in ("qr_kl", "qr_kl_floor")]
     _add_spectra(shown, run, main)
     _add_paths(shown, run, main)
     _add_disorder(shown, run, main)
@@ -172,7 +172,7 @@ def _add_particles(shown: Section, run: Rollout, main: bool) -> None:
         Metric("energy_ratio_no_force", "the same ratio for particles without any force",
                float(truth["energy"][0] / truth["energy"][-1])),
         Metric("velocity_error", "velocity error by particle at the end (normalised L2)", final["velocity_error"]),
-        Metric("early_time", "early time / T: half a turnover, or the end if that is earlier", early / run.turnover),
+        Metric("early_time", "early time / T (half a turnover, or the end if it is earlier)", early / run.turnover),
         Metric("early_velocity_error", "velocity error by particle at the early time", early_error),
         Metric("early_velocity_error_no_force", "the same error for particles without any force", early_without),
         Metric("velocity_kl", "KL divergence of the velocity PDF at the end", final["velocity_kl"]),
@@ -230,9 +230,9 @@ def _add_paths(shown: Section, run: Rollout, main: bool) -> None:
         "lagrangian", "Lagrangian statistics", rollout_figures.path_statistics(model, truth, run.turnover),
         f"Over {truth.times[-1] / run.turnover:.2f} T. A, C: autocorrelations of velocity and acceleration. B, E: "
         "second moment and flatness (3 if Gaussian) of velocity increments over a lag. D: variance of an acceleration "
-        "component. F: mean square change of the separation of nearest neighbours, over its first mean square. G, H: "
-        "tetrads, a particle and its three nearest neighbours: R² in units of its first value, and the eigenvalues of "
-        "the moments over R² (1/3 each for a regular tetrahedron). Rms of ln(model / truth): "
+        "component. F: mean square change of the separation of nearest neighbours / its first mean square. G, H: "
+        "tetrads of a particle and its three nearest neighbours. G: R² / its first value. H: eigenvalues of the "
+        "moments / R² (1/3 each for a regular tetrahedron). Rms of ln(model / truth): "
         + ", ".join(f"{name} {errors[key]:.2g}" for name, key in (
             ("flatness", "flatness_error"), ("pairs", "pair_dispersion_error"), ("tetrads", "tetrad_size_error"),
             ("shape of tetrads", "tetrad_shape_error"))) + ".")

@@ -29,7 +29,7 @@ MARKERS = list(zip((MODEL, TRUTH, SECOND, FOURTH, THIRD, DNS, FILTERED), "os^DvP
 COSTS = {"end": "end of the rollout (T)", "stopped_at": "became unstable at (T)", "wall_seconds": "wall seconds per T",
          "wall_seconds_low": "wall seconds, lower quartile", "wall_seconds_high": "wall seconds, upper quartile",
          "core_seconds": "core seconds per T", "seconds_per_step": "seconds per step", "time_step": "time step",
-         "ranks": "ranks", "weights": "learned numbers", "training_seconds": "training (s)",
+         "ranks": "ranks", "weights": "number of weights", "training_seconds": "training (s)",
          "training_steps": "training (steps)", "step_seconds": "search for the step (s)",
          "break_even_simulation": "cheaper than the direct simulation after (T)",
          "break_even_grid": "cheaper than the cheapest grid of equal or smaller error at T/2 after (T)"}

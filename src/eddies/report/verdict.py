@@ -25,7 +25,7 @@ SPECTRUM = (0.05, 0.2)          # rms of ln(E/E_filtered)
 DIVERGENCE = (0.002, 0.02)      # nats; normal distributions whose deviations differ by 4 % and 14 % have these values
 FLOORS = (2.0, 5.0)             # times the error of samples of the truth itself
 LEAST_BASELINE = 0.1            # velocities are judged if their error without any force is at least this
-KERNEL_WORDS = {GOOD: "better than", FAIR: "no improvement over", POOR: "worse than"}
+KERNEL_WORDS = {GOOD: "better than", FAIR: "about as good as", POOR: "worse than"}
 TEXTBOOK = {"cubic_spline": "cubic spline", "wendland": "Wendland kernel"}
 
 
@@ -60,7 +60,7 @@ class Judged:
     def metric(self) -> Metric:
         """The row of this number in the table."""
         return Metric(self.key, self.words, {
-            "this run": self.value, "verdict": self.mark, "beside it": self.baseline_text,
+            "this run": self.value, "verdict": self.mark, "for comparison": self.baseline_text,
             "good": self.within.format(self.good), "fair": self.within.format(self.fair)})
 
 
@@ -87,8 +87,8 @@ def section(sections: Mapping[str, Section], warned: bool) -> Section:
             *(f"Learned kernel: {each.short} {each.value:.2g}, {KERNEL_WORDS[each.mark]} the "
               f"{each.baseline_text.replace(': ', ' (')})." for each in of_kernel)]
     if "forced" in sections:
-        text.append("A forced flow differs from its truth after one or two turnovers. The section on the stationary "
-                    "state compares its averages.")
+        text.append("A forced flow differs from its truth after one or two turnovers. The section about the forced "
+                    "rollout compares averages.")
     if warned:
         text.append("Read the warnings of this report first: these numbers may not belong together.")
     return Section(KEY, "Verdict", " ".join(text), metrics=[each.metric for each in of_rollout + of_model + of_kernel])
@@ -143,7 +143,7 @@ def _model(numbers: Mapping[str, Any]) -> Iterator[Judged]:
     if error is not None:
         baseline, baseline_text = 1.0, "no model: 1"
         if gradient is not None and gradient < 1:
-            baseline, baseline_text = gradient, f"with the exact filtered pressure gradient: {gradient:.2g}"
+            baseline, baseline_text = gradient, f"the exact filtered pressure gradient alone: {gradient:.2g}"
         yield Judged("acceleration_error", "model: acceleration error at the true state",
                      "acceleration error at the true state", error, error,
                      *(limit * baseline for limit in BESIDE_GRADIENT), baseline_text)

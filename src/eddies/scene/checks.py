@@ -92,8 +92,8 @@ def check_flow(flow: Flow, initial: Initial, forcing: Forcing | None, model: Mod
     if initial.flow.sound and not flow.compressible:
         yield "initial.kind", 'sound needs a compressible fluid; set [flow] fluid = "compressible"'
     if model and initial.flow.steady and flow.viscosity == 0 and forcing is None:
-        yield "initial.kind", ("without viscosity this flow has no acceleration, but a model needs one as its unit; "
-                               "choose another kind, or raise [flow] viscosity")
+        yield "initial.kind", ("without viscosity this flow has no acceleration, which is the unit of a model's "
+                               "forces; choose another kind, or raise [flow] viscosity")
     for key in InitialFlow().keys:
         if key not in initial.flow.keys and getattr(initial, key) != type(initial).__dataclass_fields__[key].default:
             kinds = [kind for kind, each in INITIAL_FLOWS.items() if key in each.keys]
@@ -113,7 +113,7 @@ def check_time(time: Time, flow: Flow, forcing: Forcing | None, spin_up: SpinUp 
     if tracers is None and time.duration is None:
         yield "time.duration", "this key is missing; without [tracers] it is the run time, a number above 0"
     if tracers is not None and time.duration is not None:
-        yield "time.duration", "with [tracers] the run time is [tracers] turnovers; remove one of the two"
+        yield "time.duration", "with [tracers] the run time is [tracers] turnovers; remove this key, or [tracers]"
     if spin_up and spin_up.stationary:
         if not (forcing and forcing.injection_rate > 0 and flow.viscosity > 0):
             yield "spin_up.stationary", ("only a flow with forcing and viscosity becomes stationary; add [forcing] "
@@ -146,7 +146,8 @@ def check_filtered(tracers: Tracers, present: Collection[str]) -> Problems:
     made = [f"[{name}]" for name in ("kernel", "model", "training", "simulation") if name in present]
     if not tracers.filtered and made:
         yield "tracers.filtered", ("these particles follow the unfiltered velocity, but kernels, models and rollouts "
-                                   f"need the filtered one; choose another set, or remove {', '.join(made)}")
+                                   "need the filtered one; set it to true, choose another set of tracers, or "
+                                   f"remove {', '.join(made)}")
 
 
 def check_sets(tracers: Tracers, variants: Collection[str]) -> Problems:
@@ -162,8 +163,8 @@ def check_reach(section: str, neighbors: float, tracers: Tracers, skin: float) -
     reach = tracers.radius_of(neighbors) * (1 + skin)
     if reach >= math.pi:  # a particle would interact with another one and its periodic image
         yield f"{section}.neighbors", (
-            f"with {tracers.particles} particles the radius and skin are {reach:.3g}, half the cube is {math.pi:.3g}; "
-            "lower neighbors or raise [tracers] particles_per_side")
+            f"with {tracers.particles} particles radius and skin together are {reach:.3g}, but must be less than half "
+            f"the cube, {math.pi:.3g}; lower neighbors or raise [tracers] particles_per_side")
 
 
 def check_needs(present: Collection[str], needs_model: bool, has_weights: bool) -> Problems:
@@ -195,8 +196,8 @@ def check_density(flow: Flow, model: Model | None, simulation: Simulation | None
         if "density" in one.reads and "density" in one.gives:
             yield "model.terms", f'"{name}" both reads and gives the density; it can do only one of the two'
         if "density" not in reads and rates >= {*one.gives}:
-            yield "model.terms", (f'"{name}" gives only the density, which no term reads; remove it, or add a term '
-                                  "that reads it")
+            yield "model.terms", (f'"{name}" gives only the density, which no term reads; remove this term, or add '
+                                  "one that reads the density")
         if "density" in one.reads and not rates & gives:
             yield "model.terms", (f'"{name}" reads the density, which no term gives; add one that gives it, such as '
                                   f'"pressure" or "continuity", or {leave}')
@@ -274,8 +275,8 @@ def check_coarse_grid(eulerian: Eulerian | None, cells: int, flow: Flow, model: 
         yield "eulerian.cells", (f"must be at most [flow] cells = {flow.cells}, because the coarse grid starts from "
                                  "that flow; lower it")
     if eulerian.form.learned and model and not model.damping:
-        yield "eulerian.closure", ('takes the rates of the term "damping", which [model] lacks; add it to its terms, '
-                                   "or choose another closure")
+        yield "eulerian.closure", ('needs the rates of the term "damping", which [model] lacks; add this term to '
+                                   "its terms, or choose another closure")
     if eulerian.compressible and not flow.compressible:
         yield "eulerian.fluid", "[flow] fluid is incompressible and gives no sound speed; set both to the same fluid"
 

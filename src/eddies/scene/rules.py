@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-IMPORT_PATH = 'the import path "module:name" of your own'
+IMPORT_PATH = 'the import path "module:name" of your own class or function'
 # Smallest and largest magnitude of a real number, and largest whole number. Beyond them squares and cubes overflow, or
 # a run does not end.
 SMALLEST, LARGEST, MOST = 1e-15, 1e15, 10**9

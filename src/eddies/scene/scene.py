@@ -240,8 +240,8 @@ class Scene(Section):
         for stage in stages:
             if stage not in self.stages:
                 if self.sets:
-                    raise SceneError(f"{self.name}: `eddies {stage}` needs one set of tracers; set [tracers] set to "
-                                     f"one of {', '.join(self.sets)}")
+                    raise SceneError(f"{self.name}: `eddies {stage}` works on one set of tracers; choose it by the "
+                                     f"key set of [tracers]: {', '.join(self.sets)}")
                 if stage == "train" and self.model is not None and self.simulation is not None:
                     raise SceneError(f'{self.name}: [simulation] method = "{self.simulation.method}" needs no trained '
                                      'model; set method = "learned" to train one')
@@ -293,8 +293,8 @@ class Scene(Section):
         elif not isinstance(variant, Scene) or variant.variant or variant.realisations:
             yield "must be a scene without variants and realisations of its own"
         elif variant.sets:
-            yield (f"needs one set of tracers; set {VARIANT}.{name}.tracers.set, or [tracers] set for all, to one of "
-                   f"{', '.join(variant.sets)}")
+            yield (f"works on one set of tracers; choose it by the key {VARIANT}.{name}.tracers.set, or for all "
+                   f"variants by the key set of [tracers]: {', '.join(variant.sets)}")
         elif variant.simulation is None or self.simulation is None:
             yield "variants are compared by their rollouts; add [simulation] to the scene and to its variants"
         else:

@@ -98,8 +98,8 @@ class Initial(Section):
     wavenumber: int = integer("number of waves in the cube; abc, shear-wave, sound-wave only", default=1, at_least=1)
     path: str | None = text("file to start from, on any grid: ground_truth.h5 or its run directory, JHTDB cutout or "
                             "fluidsim state; kind spectrum: a text file with k and E(k) in each line", default=None)
-    state: int = integer("index in time of the state in this file; it is in fields/final, with tracers in "
-                         "fields/unfiltered, in a cutout in velocity_####", default=0, at_least=0)
+    state: int = integer("number of the state in this file, from 0 in order of time; states are in fields/final, "
+                         "with tracers in fields/unfiltered, of a cutout in velocity_####", default=0, at_least=0)
 
     @property
     def file(self) -> Path | None:
@@ -133,7 +133,7 @@ class Tracks(Section):
                                                "box", default=None)
     margin: float | None = number("distance between the volume and its image in the periodic cube around it; absent: "
                                   "four mean spacings", default=None, above=0)
-    time_unit: float = number("the file's unit of time, in the time unit of its velocities", default=1.0, above=0)
+    time_unit: float = number("factor from times of the file to the time unit of its velocities", default=1.0, above=0)
     interval: float | None = number("time between frames, for an npz file without times", default=None, above=0)
     filtered: bool = boolean("whether the particles follow a filtered velocity; false: the unfiltered one",
                              default=False)
@@ -211,8 +211,8 @@ class Tracers(Section):
 
     _holder: ClassVar[str] = "sets"
 
-    set: str | None = text("NAME of the set [tracers.NAME] to use; absent: if there are sets, only the ground truth of "
-                           "each is made", default=None)
+    set: str | None = text("NAME of the set [tracers.NAME] to use; absent: a scene with sets makes only their "
+                           "ground truths", default=None)
     particles_per_side: int | None = integer("cube root of the number of particles", default=None, at_least=2,
                                              at_most=MOST_CELLS)
     count: int | None = integer("number of particles, if particles_per_side is absent", default=None, at_least=8,
@@ -428,7 +428,7 @@ class Training(Section):
     precision: str = choice("precision of the training", "float32", "float64", default="float32")
     field_weight: float = number("weight of the field loss beside the trajectory loss", default=0.0, at_least=0)
     field_target: str = choice("reference of the field loss; tracers: the kernel average of the true particles; flow: "
-                               "the filtered field stored one frame later, on frames that have one", "tracers", "flow",
+                               "the filtered field one frame later, for frames where it is stored", "tracers", "flow",
                                default="tracers")
     velocity_kl_weight: float = number("weight of the KL divergence of velocity PDFs", default=0.0, at_least=0)
     acceleration_kl_weight: float = number("weight of the KL divergence of acceleration PDFs", default=0.0, at_least=0)

@@ -302,8 +302,8 @@ class FilteredEquations(TermSettings):
 
     reads = ("pairs", "density")
     gives = ("acceleration", "density_rate")
-    too_long = ('"{name}" relaxes the noise of the particles so fast that it grows with integrator = "{integrator}" '
-                "in steps of more than about {longest}; lower step to that")
+    too_long = ('with integrator = "{integrator}" and steps above about {longest} the noise of the particles, which '
+                'the term "{name}" damps, grows instead; lower step to {longest}')
 
     def longest_step(self, units: StepUnits) -> float:
         """The longest step in which the scheme can follow the relaxation of the noise of single particles."""

@@ -156,8 +156,9 @@ def rule_of(kind: type, field: dataclasses.Field) -> Rule | None:
     annotation = field.type if isinstance(field.type, str) else inspect.formatannotation(field.type)
     rule = ANNOTATIONS.get(annotation.removesuffix(" | None"))
     if rule is None:
-        raise SceneError(f"{kind.__qualname__}.{field.name}: {annotation}: declare the key by number, integer, "
-                         f"boolean, text, ... of eddies, or annotate it with one of {', '.join(ANNOTATIONS)}")
+        raise SceneError(f"{kind.__qualname__}.{field.name}: {annotation}: declare the key by a function of "
+                         f"eddies (number, integer, boolean, text, ...), or annotate it with one of "
+                         f"{', '.join(ANNOTATIONS)}")
     return rule
 
 

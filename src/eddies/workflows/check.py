@@ -112,7 +112,8 @@ def lines(found: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
             yield key, as_text(value)
     rows = {name_of(row): row for row in found["stage_costs"]} | {"total": found["totals"]}
     width = max(map(len, rows))
-    yield "costs", "wall time within a factor of three: on these ranks, then on the largest number that a stage can use"
+    yield "costs", ("on these ranks, then on the most ranks that a stage can use; wall times are right within a factor "
+                    "of three")
     yield "costs", f"{'stage':{width}}  {'wall time':>12}  memory a rank      disk"
     for name, row in rows.items():
         line = f"{name:{width}}  {wall_time(row['seconds']):>12}  {in_units(row['memory']):>13}  "

@@ -69,9 +69,9 @@ class Stretch:
         self.frame = min((frame for frame in truth.state_frames if frame > 0), default=1)
         most = (len(truth.times) - 1 - self.frame) // every
         if most < 1:
-            raise SceneError(f"[simulation] frame_interval = {interval:g}: a ground truth ends at "
-                             f"{truth.times[-1]:.3g}, and the search for the step needs this interval after "
-                             f"{truth.times[self.frame]:.3g}; lower frame_interval, or raise [tracers] turnovers")
+            raise SceneError(f"[simulation] frame_interval = {interval:g}: the search for the step needs one such "
+                             f"interval after t = {truth.times[self.frame]:.3g}, but a ground truth ends at "
+                             f"{truth.times[-1]:.3g}; lower frame_interval, or raise [tracers] turnovers")
         count = min(max(round(TURNOVERS * self.turnover / interval), 1), most)
         self.stops = np.arange(1, count + 1) * interval
         self.end = truth.block(self.frame + count * every, ("velocity",))["velocity"]
@@ -163,7 +163,7 @@ class Ladder:
             coarser, finer = (self._tried(stretch, trial.step) for trial in (whole, half))
             if not coarser.distance(finer) < finer.tolerance:
                 log.info("find-step: %s %.4g has not converged on ground truth %d of %d", self.integrator,
-                         whole.step.size, number, len(self._stretches) - 1)
+                         whole.step.size, number + 1, len(self._stretches))
                 return False
         return True
 
@@ -238,8 +238,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             "turnovers": span / stretches[0].turnover})
         for name, table in tables.items():
             write_table(file, f"trials/{name}", table)
-    log.info("find-step: found %s with %s %.4g, %.3g s per turnover. With half this value the velocity changes by "
-             "%.4f of its rms, and its error is %.4f", found.step.integrator,
+    log.info("find-step: found %s with %s %.4g, %.3g s per turnover. Half of it changes the final velocity by %.4f "
+             "of its rms; the error is then %.4f", found.step.integrator,
              "Courant number" if settings.on_grid else "step", found.step.size, found.seconds, difference, half.error)
 
 

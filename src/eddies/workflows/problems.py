@@ -194,8 +194,8 @@ def _large_files(needs: Mapping[str, Disk], ranks: int) -> Iterator[str]:
     """Yield a problem for each product that is too large for rank 0 to write for all ranks."""
     for stage, needed in needs.items():
         if (size := (needed.kept or 0.0) - needed.other_files) > LARGEST_BYTES:
-            yield (f"{STAGES[stage].file}: this h5py is built without MPI, so rank 0 writes for {ranks} ranks, at most "
-                   f"{in_units(LARGEST_BYTES)} a file, but this file will take {in_units(size)}; {REMEDY}")
+            yield (f"{STAGES[stage].file}: this h5py has no MPI, so rank 0 writes the file for all {ranks} ranks, and "
+                   f"it can have at most {in_units(LARGEST_BYTES)}; it will take {in_units(size)}; {REMEDY}")
 
 
 def directory_problems(stages: Sequence[str], comm: Comm, directory: Path) -> list[str]:
@@ -342,8 +342,8 @@ def untrained_terms(model: Model, training: Training) -> Iterator[str]:
     """Yield a warning for each term whose parameters are not trained."""
     for name, settings in model.settings.items():
         if settings.learns_through_horizons and training.horizons is None:
-            yield (f'[model] terms: "{name}" learns only in the training through horizons, and the scene has none, so '
-                   "its parameters keep their initial values; add [training.horizons]")
+            yield (f'[model] terms: only [training.horizons] trains the term "{name}", and the scene lacks this '
+                   "section, so the term keeps its initial parameters; add [training.horizons]")
 
 
 def rollout_steps(settings: Simulation, allowed: float | None, model: Model, units: StepUnits) -> Iterator[str]:

@@ -42,8 +42,8 @@ def run(directory: Path, comm: Comm, verify: bool = False) -> None:
         old = on_first_rank(comm, lambda: before_checksums(path))
         complaint = None if old else _complaint(comm, path)
         damaged += complaint is not None
-        _print(comm, complaint or
-               f"{path}: {'has no checksums, because an earlier version made it' if old else 'as written'}")
+        state = "has no checksums, because an earlier version made it" if old else "unchanged since it was written"
+        _print(comm, complaint or f"{path}: {state}")
     if damaged:
         raise UserError(f"{directory}: {damaged} of {len(products)} products are damaged or cannot be read")
 

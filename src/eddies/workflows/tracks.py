@@ -56,8 +56,8 @@ def with_tracks(scene: Scene, comm: Comm) -> Scene:
     found = in_files(comm, settings.file, lambda: _sections_of(settings, learned))
     for name, own in found.items():
         if getattr(scene, name) not in (None, own):
-            raise SceneError(f"[{name}]: does not fit [tracks], which takes the place of this section; remove it, in "
-                             f"the scene of a run by --unset {' --unset '.join(found)}")
+            raise SceneError(f"[{name}]: does not fit [tracks], which takes the place of this section; remove it (in "
+                             f"the scene.toml of a run: --unset {' --unset '.join(found)})")
     return replace(scene, **found, variant={name: replace(each, **found) for name, each in scene.variant.items()})
 
 
@@ -176,7 +176,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         write_attributes(file.create_group("tracks"), {
             **tracks.about, "complete": complete, "mean_count": tracks.mean_count, "weight": weight,
             "validation_error": error})
-    log.info("dns: %d tracks, on average %.0f in a frame, %d in all %d frames; duration %.3g T, u' = %.3g, L = %.3g",
+    log.info("dns: %d tracks, on average %.0f in a frame; %d are in each of the %d frames; duration %.3g T, u' = %.3g, "
+             "L = %.3g",
              tracks.about["in_file"], tracks.mean_count, complete, len(times),
              times[-1] / reference["eddy_turnover_time"], math.sqrt(2 * float(spectra[0][1].sum()) / 3),
              reference["integral_scale"])

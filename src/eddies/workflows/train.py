@@ -87,11 +87,11 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     if curves is not None:  # after the product is written: a failing picture must not lose it
         curves.draw(training)
     errors = tables["a_priori"]
-    beside = (f" (with the exact filtered pressure gradient: {errors['pressure_gradient_error'][-1]:.3f})"
+    beside = (f" (the exact filtered pressure gradient alone: {errors['pressure_gradient_error'][-1]:.3f})"
               if "pressure_gradient_error" in errors else "")
     since = ("end of the training window" if own is not None
              else "release of the tracers; trained on other ground truths")
-    log.info("model: a-priori acceleration error %.3f%s, measured at a time %.3g after the %s",
+    log.info("model: a-priori acceleration error %.3f%s, measured a time of %.3g after the %s",
              errors["acceleration_error"][-1], beside, errors["delay"][-1], since)
 
 

@@ -157,8 +157,8 @@ def notes(scene: Scene) -> list[str]:
     own = [name for name, variant in variants.items() if _kernel_of(variant) != _kernel_of(_measure_of(scene))]
     if own:
         blank = " and ".join(MEASURES[measure] for measure in THROUGH_KERNEL)
-        found.append(f"{', '.join(own)}: no {blank}. These numbers need the smoothing kernel, and a kernel with other "
-                     "settings would give values that cannot be compared.")
+        found.append(f"{', '.join(own)}: no {blank}, because these numbers need the smoothing kernel, and its "
+                     "settings differ there.")
     grids = {name: variant.coarse_cells for name, variant in variants.items() if variant.coarse_cells}
     if grids:
         kept = ", ".join(f"{(cells - 1) // 3} in {name}" for name, cells in grids.items())

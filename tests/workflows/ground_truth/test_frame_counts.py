@@ -53,5 +53,5 @@ def test_a_rollout_starts_at_the_first_field_that_truth_follows(frames, every):
     if usable:
         assert rollout_start(tiny.simulation, tiny.tracers, 0.5, frames, field_frames) == usable[0]
     else:
-        with pytest.raises(SceneError, match="start: from frame"):
+        with pytest.raises(SceneError, match="start: the rollout needs a frame"):
             rollout_start(tiny.simulation, tiny.tracers, 0.5, frames, field_frames)

@@ -132,8 +132,8 @@ def test_all_ranks_take_the_values_of_the_first(comm, caplog):
 
 @pytest.mark.mpi(2)
 @pytest.mark.parametrize("drawn, message", [
-    (lambda rank: nn.Parameter(torch.ones(3 + rank)), r"drawn torch.float32 \[4\] on rank 1"),
-    (lambda rank: nn.Parameter(torch.ones(3), requires_grad=rank == 0), "that is not trained on rank 1"),
+    (lambda rank: nn.Parameter(torch.ones(3 + rank)), r"rank 1 has drawn torch.float32 \[4\] where"),
+    (lambda rank: nn.Parameter(torch.ones(3), requires_grad=rank == 0), "rank 1 has drawn .* that is not trained where"),
     (lambda rank: nn.UninitializedParameter(), "drawn has no shape")], ids=["shape", "fixed", "lazy"])
 def test_parameters_that_cannot_be_copied_are_refused(comm, drawn, message):
     model = parameters(comm.rank)
@@ -148,7 +148,7 @@ def test_another_order_of_parameters_on_a_rank_is_refused(comm):
     model = parameters(0)
     if comm.rank == 1:
         model.register_parameter("kept", model._parameters.pop("kept"))
-    with pytest.raises(SceneError, match="drawn .* on rank 1 is in the place of kept .* on rank 0"):
+    with pytest.raises(SceneError, match="rank 1 has drawn .* where rank 0 has kept"):
         take_from_first_rank(model, comm)
 
 

@@ -279,7 +279,7 @@ def test_another_truth_limits_the_number_of_ranks(comm, tmp_path):
     place = f'[training] truths: "{tmp_path / "other"}"'
     for model, most, reason in (('{terms=["viscosity"]}', 2, "ghost planes of the resolved velocity"),
                                 ('{preset="paper", neighbors=8}', 2,
-                                 "slabs no thinner than the particles' reach 1.95")):
+                                 "slabs, at least as thick as the particles' reach 1.95")):
         alone = scene_of(tmp_path, "tracers.particles_per_side=8", f"model={model}")
         alone = replace(alone, training=replace(alone.training, horizons=None))
         scene = trained_on(alone, tmp_path / "nowhere", tmp_path / "other")

@@ -46,9 +46,9 @@ class EddyViscosity(PairTerm):
     def learned_coefficients(self) -> list[Coefficient]:
         scales, (linear, quadratic) = self.flow.scales, self.coefficients.detach().abs()
         per_rate = scales.filter_width / scales.velocity
-        return [Coefficient.of("|a_1|", linear, "friction of a pair: acceleration by its approach rate mu", "L/T",
+        return [Coefficient.of("|a_1|", linear, "friction of a pair: acceleration per approach rate mu", "L/T",
                                scales.acceleration * per_rate),
-                Coefficient.of("|a_2|", quadratic, "repulsion of a pair: acceleration by mu^2", "L",
+                Coefficient.of("|a_2|", quadratic, "repulsion of a pair: acceleration per mu^2", "L",
                                scales.acceleration * per_rate**2)]
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
@@ -91,9 +91,9 @@ class DensityDiffusion(PairTerm):
         scales, (linear, quadratic) = self.flow.scales, self.coefficients.detach().abs()
         rate = scales.required("density_rate")
         per_difference = scales.filter_width**2 / scales.required("density")
-        return [Coefficient.of("|b_1|", linear, "diffusion of the density: its rate by the difference q of a pair",
+        return [Coefficient.of("|b_1|", linear, "diffusion of the density: its rate per difference q of a pair",
                                "L^2/T", rate * per_difference),
-                Coefficient.of("|b_2|", quadratic, "nonlinear diffusion of the density: its rate by |q| q",
+                Coefficient.of("|b_2|", quadratic, "nonlinear diffusion of the density: its rate per |q| q",
                                "L^7/(M T)", rate * per_difference**2)]
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:

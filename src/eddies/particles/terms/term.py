@@ -54,7 +54,7 @@ class Term(nn.Module, TermBase):
     def learned_coefficients(self) -> list[Coefficient]:
         """Learned coefficients; by default only the number of parameters."""
         count = sum(parameter.numel() for parameter in self.parameters())
-        return [Coefficient("weights", count, count, "1", "learned numbers")] if count else []
+        return [Coefficient("weights", count, count, "1", "number of weights")] if count else []
 
     def forward(self, context: Context) -> Rates:
         """Contribution to all owned particles; may be collective."""

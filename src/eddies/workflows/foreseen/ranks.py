@@ -28,8 +28,9 @@ def most_ranks(scene: Scene) -> dict[str, int]:
         ghosts = GHOST_PLANES[tracers.interpolation]
         limits[f"{ghosts} ghost planes of the {tracers.interpolation} splines"] = scene.flow.cells // ghosts
     if scene.kernel:
-        limits[f"slabs of the fields no thinner than the kernel's support {scene.kernel_support:.3g}"] = thick_slabs(
-            tracers.cells, scene.kernel_support)
+        support = scene.kernel_support
+        limits[f"slabs of the fields, at least as thick as the kernel's support {support:.3g}"] = thick_slabs(
+            tracers.cells, support)
     if learned_neighbors or simulation is not None and "pairs" in simulation.needs:
         limits |= reach_limit(tracers, scene.interaction_radius + skin)
     if trains:
@@ -110,7 +111,7 @@ def rank_problems(limits: Mapping[str, int], ranks: int) -> Iterator[str]:
 
 def reach_limit(tracers: Tracers, reach: float, when: str = "") -> dict[str, int]:
     """The limit, by its name, from the distance `reach` over which particles interact; the name ends with `when`."""
-    return {f"slabs no thinner than the particles' reach {reach:.3g}{when}": thick_slabs(tracers.planes, reach)}
+    return {f"slabs, at least as thick as the particles' reach {reach:.3g}{when}": thick_slabs(tracers.planes, reach)}
 
 
 def thick_slabs(planes: int, width: float) -> int:

@@ -41,9 +41,9 @@ def last_trained_on(settings: Training, frames: int) -> int:
     held_out = max(math.ceil(HELD_OUT * last), longest, 2)  # rates need a frame on both sides
     if last - held_out - longest < 2:
         raise SceneError(
-            f"[training] window = {settings.window:g}: holds {last + 1} frames of the ground truth, too few "
-            f"with {held_out} held out for validation and horizons of {longest}; raise it or [tracers] "
-            "turnovers, or lower [tracers] frame_interval or [training.horizons] frames")
+            f"[training] window = {settings.window:g}: holds {last + 1} frames; too few remain for training, "
+            f"because {held_out} are for validation, and the longest horizon takes {longest}; raise window or "
+            "[tracers] turnovers, or lower [tracers] frame_interval or [training.horizons] frames")
     return last - held_out
 
 
@@ -77,9 +77,10 @@ def rollout_start(settings: Simulation, tracers: Tracers, seen: float, frames: i
     last = frames - 2 - round(settings.frame_interval / tracers.frame_interval)
     usable = [frame for frame in field_frames if wanted <= frame <= last]
     if not usable:
-        raise SceneError(f"[simulation] start: from frame {wanted} of {frames} on, no frame has a filtered field and "
-                         f"one more frame interval of the rollout ({settings.frame_interval:g}) after it; lower start, "
-                         "frame_interval, [training] window or [tracers] field_every, or raise [tracers] turnovers")
+        raise SceneError(f"[simulation] start: the rollout needs a frame with a filtered field and one more frame "
+                         f"interval ({settings.frame_interval:g}) after it, but there is none from frame {wanted} of "
+                         f"{frames} on; lower start, frame_interval, [training] window or [tracers] field_every, or "
+                         "raise [tracers] turnovers")
     return usable[0]
 
 

@@ -54,8 +54,8 @@ def take_from_first_rank(model: nn.Module, comm: Comm) -> None:
     wrong = next(((mine, other) for mine, other in zip_longest(own, first, fillvalue=["", "nothing"])
                   if mine != other), None)
     complaint = first_complaint(comm, wrong and (
-        f"[model] terms: {' '.join(wrong[0]).strip()} on rank {comm.rank} is in the place of "
-        f"{' '.join(wrong[1]).strip()} on rank 0; register the same tensors on all ranks, in one order"))
+        f"[model] terms: rank {comm.rank} has {' '.join(wrong[0]).strip()} where rank 0 has "
+        f"{' '.join(wrong[1]).strip()}; register the same tensors in the same order on all ranks"))
     if complaint is not None:
         raise SceneError(complaint)
     shapeless = next((name for name, tensor in tensors if is_lazy(tensor)), None)

@@ -149,8 +149,8 @@ def load_frame(truth: GroundTruth, index: int, model: LagrangianModel, dtype: to
     solves = [] if dynamics.resolution is None else dynamics.resolution.solves
     for iterations, residual, converged in solves:
         if not converged and truth.decomposition.comm.rank == 0:
-            log.warning("frame %d: a solve for the resolved velocity did not converge in %d iterations, residual %.1e",
-                        index, iterations, residual)
+            log.warning("frame %d: a solve for the resolved velocity did not converge in %d iterations, but the result "
+                        "is used; its residual is %.1e", index, iterations, residual)
     return frame
 
 

@@ -192,10 +192,11 @@ def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame:
     grid, series = fluid.grid, truth.states
     if frame not in truth.state_frames:
         stored = ", ".join(f"{time / truth.times[-1]:.3g}" for time in series.times)
-        remedy = f"only at {stored}; set [simulation] start to such a value, or make" if stored else "at no time; make"
+        remedy = f"only at {stored}; set [simulation] start to one of these, or" if stored else "at no time;"
         raise SceneError(
             f'[simulation] method = "eulerian": the rollout starts at {truth.times[frame] / truth.times[-1]:.3g} of the'
-            f" ground truth, which holds the unfiltered flow {remedy} the ground truth again for this start")
+            f" ground truth, which holds the unfiltered flow {remedy} remove ground_truth.h5 and run `eddies dns` "
+            "with this start")
     slab = SlabDecomposition(grid.decomposition.comm, grid.decomposition.length, series.cells)
     whole = SpectralGrid(slab, grid.precision, (series.cells - 1) // 2)
 

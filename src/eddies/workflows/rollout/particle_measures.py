@@ -149,5 +149,6 @@ class ParticleSpectra:
         if not flow.converged:
             self.complaints.append(
                 f"at time {particles.times[frame]:.3g} the solve for the spectrum of the {whose} did not converge in "
-                f"{flow.iterations} iterations (residual {flow.residual:.1e}): particles have clustered and left voids")
+                f"{flow.iterations} iterations (residual {flow.residual:.1e}); this spectrum is less accurate, because "
+                "particles have clustered and left voids")
         return as_numpy(flow.spectrum[:max(self._resolution.grid.resolved, 2)]).astype(float)
