@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eddies.learning.losses import kullback_leibler, mean_square_share, relative_error, soft_histogram
+from eddies.learning.losses import kullback_leibler, mean_square_share, soft_histogram
 from eddies.learning.optimization import Adam, shared_values
 from eddies.parallel.reduction import global_sum
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.exchanges import mean_over_ranks, sum_over_ranks
+from eddies.particles.exchanges import mean_over_ranks, relative_error, sum_over_ranks
 from eddies.particles.model import LagrangianModel
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.neighborhood import Neighborhood

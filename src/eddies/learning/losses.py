@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from eddies.parallel.communicator import Comm
-from eddies.parallel.reduction import global_sum
 from eddies.particles.exchanges import sum_over_ranks
 
 
@@ -18,13 +16,6 @@ def mean_square_share(error: Tensor, scale: float, total: int) -> Tensor:
     """
     components = error.shape[1] if error.dim() > 1 else 1
     return (error / scale).square().sum() / (components * total)
-
-
-def relative_error(comm: Comm, error: Tensor, exact: Tensor) -> float:
-    """Normalised L2 error |error| / |exact| over the rows of all ranks; collective."""
-    squares = [float(part.detach().double().square().sum()) for part in (error, exact)]
-    wrong, whole = global_sum(comm, np.array(squares))
-    return float(np.sqrt(wrong / whole))
 
 
 def soft_histogram(comm: Comm, values: Tensor, bins: int, reach: float) -> Tensor:

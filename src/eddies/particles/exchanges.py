@@ -1,7 +1,8 @@
-"""Differentiable communication between ranks: ghost particles, sums and means."""
+"""Communication between ranks on tensors: ghost particles, sums and means, all differentiable, and error norms."""
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -65,3 +66,10 @@ def mean_over_ranks(comm: Comm, rows: Tensor) -> Tensor:
     """
     total = sum_over_ranks(comm, torch.cat([rows.sum(0), rows.new_tensor([len(rows)])]))
     return total[:-1] / total[-1]
+
+
+def relative_error(comm: Comm, error: Tensor, exact: Tensor) -> float:
+    """Normalised L2 error |error| / |exact| over the entries of all ranks, NaN if `exact` is zero; collective."""
+    square, whole = global_sum(comm, np.array([float(part.detach().double().square().sum())
+                                               for part in (error, exact)]))
+    return float(np.sqrt(square / whole)) if whole > 0 else np.nan

@@ -30,10 +30,10 @@ import torch
 from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import IdOrder
-from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
+from eddies.particles.exchanges import relative_error
 from eddies.pipeline import STAGES
 from eddies.scene.integrators import MOST_COURANT, SCHEMES
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError, Simulation
@@ -78,9 +78,8 @@ class Stretch:
 
     def distance(self, one: np.ndarray, other: np.ndarray) -> float:
         """Rms of the difference of two final velocities, divided by the rms of the true final velocity; collective."""
-        sums = np.array([np.sum((one.astype(np.float64) - other) ** 2), np.sum(self.end.astype(np.float64) ** 2)])
-        square, size = global_sum(self.truth.decomposition.comm, sums)
-        return float(np.sqrt(square / size))
+        return relative_error(self.truth.decomposition.comm, torch.from_numpy(one.astype(np.float64) - other),
+                              torch.from_numpy(self.end))
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,10 @@ from eddies.io.checkpoint import Checkpoint, Guard
 from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments, TrajectoryLayout
 from eddies.io.hdf5 import File, create_product, open_product, read_attributes, write_attributes, write_table
 from eddies.parallel.communicator import Comm
-from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
-from eddies.particles.exchanges import mean_over_ranks
+from eddies.particles.exchanges import mean_over_ranks, relative_error
 from eddies.particles.forms import Form
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.particle_field import ParticleField
@@ -356,14 +355,8 @@ def errors_of(modes: Tensor, mean: np.ndarray, tracers: Tracers, grid: FourierGr
     target = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
     exact = truth.planes(truth.fields, truth.field_frames.index(frame), "velocity", slab)
     given = modes if tracers.filtered else modes * grid.filter_transfer(tracers.filter_width)
-    found = {"velocity": target.backward(regrid(grid.spectral, target, as_numpy(given.resolve_conj())))
-             + mean[:, None, None, None]}
-    errors = {"velocity": (found["velocity"], exact)}
+    own = target.backward(regrid(grid.spectral, target, as_numpy(given.resolve_conj()))) + mean[:, None, None, None]
     slopes = [np.concatenate([target.backward(target.gradient(component)) for component in target.forward(field)])
-              for field in errors["velocity"]]
-    errors["gradient"] = slopes[0], slopes[1]
-    result = {}
-    for name, (own, true) in errors.items():
-        square, whole = global_sum(slab.comm, np.array([np.sum((own - true) ** 2), np.sum(true**2)]))
-        result[f"{name}_error"] = float(np.sqrt(square / whole))
-    return result
+              for field in (own, exact)]
+    return {f"{name}_error": relative_error(slab.comm, torch.from_numpy(made - true), torch.from_numpy(true))
+            for name, (made, true) in {"velocity": (own, exact), "gradient": slopes}.items()}

@@ -11,7 +11,7 @@ import torch
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.exchanges import mean_over_ranks
+from eddies.particles.exchanges import mean_over_ranks, relative_error
 from eddies.particles.flow_units import ReferenceScales
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import WEIGHT, ResolvedVelocity
@@ -61,8 +61,7 @@ def validation_error(solver: ResolvedVelocity, modes: torch.Tensor, known: Parti
     comm = solver.grid.decomposition.comm
     wanted = held_out.velocity - mean_over_ranks(comm, known.velocity)
     missed = solver.grid.at(modes, solver.grid.points(held_out.position)) - wanted
-    square, whole = global_sum(comm, np.array([float(missed.square().sum()), float(wanted.square().sum())]))
-    return math.sqrt(square / whole) if whole > 0 else math.nan
+    return relative_error(comm, missed, wanted)
 
 
 def solver_of(slab: SlabDecomposition, reference: Mapping[str, float], weight: float) -> ResolvedVelocity:

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from eddies.io.hdf5 import open_product, read_table
 from eddies.io.provenance import product_attributes, product_provenance
 from eddies.io.weights import load_weights
-from eddies.learning.losses import relative_error
+from eddies.particles.exchanges import relative_error
 from eddies.parallel.reduction import global_sum
 from eddies.particles.model import FORCING
 from eddies.scene.scene import load_scene

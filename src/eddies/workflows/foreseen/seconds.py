@@ -29,7 +29,6 @@ TRANSFORM, CACHED, SINGLE, PAIR, TRACER, WEIGHT = 4e-9, 550, 0.65, 2.5e-8, 200, 
 CALL, MESSAGE, ROUNDS = 2.5e-4, 2e-6, 4
 START = {"dns": 0.4, "train-kernel": 0.7, "reconstruct": 1.0, "train": 1.0, "find-step": 0.5, "simulate": 0.3,
          "report": 2.3}
-DERIVATIVES = 3              # cost of a neighbour in kriging of all derivatives at particles; 1 in averages
 FORM_PAIRS = {"average": 1, "linear": 1.5, "quadratic": 2.5, "kriging": 6}  # cost of a neighbour, by form
 SEARCH, CONFIRM = 2, 0.75    # turnovers that a search simulates on the first ground truth, and on each further one
 COLD, ITERATION = 25, 12     # iterations of a solve without a first guess; transforms in each iteration
@@ -82,8 +81,8 @@ def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
         if rollout is None:
             return None
         calls, pairs = rollout.evaluations, rollout.evaluations * tracers.particles * neighbors / 2
-        if model and "filtered-equations" in model.settings and "model" in scene.simulation.needs:
-            pairs *= 2 * DERIVATIVES
+        if model and "model" in scene.simulation.needs:
+            pairs *= max(term.pair_cost for term in model.settings.values())
         if scene.coarse_cells:
             calls = rollout.steps * ETDRK4.evaluations
             transforms = calls * CompressibleFluid.transforms * scene.coarse_cells**3

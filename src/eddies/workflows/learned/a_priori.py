@@ -8,11 +8,11 @@ import torch
 from eddies.analysis.lagrangian import evenly
 from eddies.clock import ProgressLine
 from eddies.learning.force_training import TrainingFrame
-from eddies.learning.losses import relative_error
 from eddies.parallel.migration import IdOrder, migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
+from eddies.particles.exchanges import relative_error
 from eddies.particles.model import FORCING, LagrangianModel
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.spectral.interpolation import SplineInterpolation
