@@ -29,9 +29,9 @@ from eddies.particles.particle_field import ParticleField
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.remembered_velocity import RememberedVelocity
 from eddies.particles.resolved_velocity import ResolvedVelocity
-from eddies.particles.smoothing_kernels import CubicSpline
+from eddies.particles.smoothing_kernels import CubicSpline, SmoothingKernel
 from eddies.pipeline import STAGES
-from eddies.scene.scene import BOX_LENGTH, Reconstruction, Scene, Tracers
+from eddies.scene.scene import BOX_LENGTH, Reconstruction, Scene, Tracers, Tracks
 from eddies.scene.sections import NEIGHBORS, RECONSTRUCTED
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.workflows.ground_truth.flow_run import restored_modes, saved_modes
@@ -103,18 +103,18 @@ class Source:
     unit : the scene's unit of length, in the unit of the tracks. corner : the tracks' origin in the cube, in that unit.
     """
 
-    def __init__(self, scene: Scene, file: File, comm: Comm) -> None:
+    def __init__(self, tracks: Tracks | None, tracers: Tracers, file: File, comm: Comm) -> None:
         self._tracks, self.truth = None, None
-        if scene.tracks is not None:
-            self._tracks = source = TrackFrames(comm, scene.tracks)
+        if tracks is not None:
+            self._tracks = source = TrackFrames(comm, tracks)
             self.times, self.spacing, self.most = source.times, source.spacing, source.most
             self.unit, self.corner = source.about["length_unit"], source.about["corner"]
-            planes = scene.tracers.with_count(round((BOX_LENGTH / self.spacing) ** 3)).planes
+            planes = tracers.with_count(round((BOX_LENGTH / self.spacing) ** 3)).planes
             self.slab = SlabDecomposition(comm, BOX_LENGTH, planes)
         else:
-            self.slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)
+            self.slab = SlabDecomposition(comm, BOX_LENGTH, tracers.planes)
             self.truth = truth = GroundTruth(file, self.slab)
-            self.times, self.spacing, self.most = truth.times, scene.tracers.spacing, truth.total
+            self.times, self.spacing, self.most = truth.times, tracers.spacing, truth.total
             self.unit, self.corner = 1.0, np.zeros(3)
 
     def particles(self, frame: int) -> ParticleSet:
@@ -242,14 +242,17 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     guard = Guard(comm, directory / STAGES["reconstruct"].checkpoints, stage_fingerprint(scene, "reconstruct"), stop,
                   " of the reconstruction")
     with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as file:
-        source, reference = Source(scene, file, comm), read_attributes(file, "reference")
+        source, reference = Source(scene.tracks, tracers, file, comm), read_attributes(file, "reference")
         width = tracers.filter_width if tracers.filtered else NO_FILTER * source.spacing
         solver, weight, _ = best_solver(source.particles(0), partial(
             solver_of, source.slab, reference | {"spacing": source.spacing, "filter_width": width}),
             settings.holdout or HELD_OUT)
         grid = solver.grid
         transfer = grid.filter_transfer(tracers.filter_width) if tracers.filtered else torch.ones_like(grid.shell)
-        make = _maker(scene, comm, directory, solver, weight, transfer, source.truth)
+        kernel: SmoothingKernel = CubicSpline(tracers.radius_of(NEIGHBORS))
+        if settings.of_neighbors and scene.kernel is not None and source.truth is not None:
+            kernel = load_form(comm, directory / STAGES["train-kernel"].file, source.truth.scales).kernel
+        make = _maker(settings, tracers, scene.flow.viscosity, kernel, solver, weight, transfer)
         whole = ReconstructionRun(source, [make() for _ in range(2 if settings.holdout > 0 else 1)], solver, settings,
                                   tracers, reference["viscosity"], transfer)
         saved = guard.checkpoints.newest()
@@ -276,19 +279,13 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         for table in tables.values() if table for key in table[0] if key != "time"))
 
 
-def _maker(scene: Scene, comm: Comm, directory: Path, solver: ResolvedVelocity, weight: float,
-           transfer: Tensor, truth: GroundTruth | None) -> Callable[[], Method]:
-    """Return a function that makes a new method of [reconstruction]."""
-    settings, tracers = scene.reconstruction, scene.tracers
+def _maker(settings: Reconstruction, tracers: Tracers, viscosity: float, kernel: SmoothingKernel,
+           solver: ResolvedVelocity, weight: float, transfer: Tensor) -> Callable[[], Method]:
+    """Return a function that makes a new method of [reconstruction]. Only estimates from neighbours use the kernel."""
     if settings.method == "least-squares":
         return lambda: LeastSquaresMethod(solver)
     if settings.method == "memory":
-        return lambda: RememberedVelocity(solver, scene.flow.viscosity, transfer, settings.memory, weight)
-    kernel_file = directory / STAGES["train-kernel"].file
-    if scene.kernel is not None and truth is not None:
-        kernel = load_form(comm, kernel_file, truth.scales).kernel
-    else:
-        kernel = CubicSpline(tracers.radius_of(NEIGHBORS))
+        return lambda: RememberedVelocity(solver, viscosity, transfer, settings.memory, weight)
     form = Form(settings.method, kernel, tracers.filter_width, tracers.spacing**3)
     return lambda: NeighbourMethod(form, solver.grid)
 
