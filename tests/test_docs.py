@@ -74,8 +74,8 @@ def folder(tmp_path, monkeypatch):
 
 
 def words_of(command):
-    """Words of a command without variables set before it and without what starts the ranks."""
-    words = shlex.split(command, comments=True)
+    """Words of a command without variables set before it, `name=$(...)` around it, and what starts the ranks."""
+    words = shlex.split(re.sub(r"^\w+=\$\((.*)\)", r"\1", command), comments=True)
     while re.fullmatch(r"[A-Z_0-9]+=.*", words[0]):
         words = words[1:]
     if words[:2] == ["python", "mpi_tools/launch.py"]:

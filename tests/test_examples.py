@@ -11,6 +11,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import torch
 
 import eddies
 
@@ -75,11 +76,14 @@ def test_a_term_of_the_users(example):
 
 @pytest.mark.mpi(2)
 def test_a_pair_term_of_the_users(example):
-    run = example("own_drag")
+    run = example("own_pair_force")
     _, terms, weights = results(run)
-    assert list(terms)[-1] == "own_drag:StrainDrag"
-    first, last = (weights[f"terms.StrainDrag.network.{part}"] for part in ("0.weight", "2.bias"))
-    assert first.shape == (8, 1) and last != np.float32(math.log(math.expm1(0.1)))  # it has been trained
+    assert [*terms] == ["own_pair_force:PairForce", "eddy-viscosity", "density-flux", "density-diffusion"]
+    with torch.random.fork_rng():
+        torch.manual_seed(1)  # the seed of tiny
+        start = torch.nn.Linear(5, 20).weight.detach().numpy()
+    learned = weights["terms.PairForce.network.0.weight"]
+    assert learned.shape == (20, 5) and 0 < np.abs(learned - start).max() < 0.5
 
 
 @pytest.mark.mpi(2)
