@@ -40,7 +40,7 @@ def width_of(result: Mapping[str, Any]) -> float:
 def best_grid(rows: Mapping[str, Row], measure: str, of_particles: bool) -> Row | None:
     """The grid with the smallest error of those that take no longer than the resolved velocity. `of_particles`: of
     those that start from the particles."""
-    rivals = [row for row in rows.values() if row["method"] == "eulerian"
+    rivals = [row for row in rows.values() if row["name"].startswith("grid-")
               and row["name"].endswith("-particles") == of_particles
               and None not in (row[measure], row["wall_seconds"])
               and row["wall_seconds"] <= rows["resolved"]["wall_seconds"]]

@@ -24,7 +24,7 @@ from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.model import build_model
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import WEIGHT, ResolvedVelocity
-from eddies.report.figures import FOURTH, GUIDE, MODEL, SECOND, TRUTH, letter, panels, png, styled
+from eddies.report.figures import DNS, FOURTH, GUIDE, MODEL, SECOND, TRUTH, letter, panels, png, styled
 from eddies.scene.scene import BOX_LENGTH
 from eddies.scene.terms import Pressure, Stress, Viscosity
 from eddies.workflows.ground_truth.truth import GroundTruth
@@ -81,19 +81,20 @@ def measure(path, shares=SHARES, iterations=ITERATIONS):
 def figure(found):
     """Errors over k_c, a panel each, and over iterations."""
     drawn, axes = panels(1, len(found) + 1, (3.4, 3.1))
+    markers = iter(("o-", "s--", "^:"))
     for (name, case), axis in zip(found.items(), axes[0]):
         share = np.array(case["highest"]) / case["nyquist"]
         for weight, colour in WEIGHTS.items():
             errors = np.array(case["by_weight"][f"{weight:g}"])[:, 0]
             axis.plot(share, errors, "o-", color=colour, markersize=3.5, label=f"weight {weight:g}")
         axis.plot(share, np.array(case["gradient"])[:, 0], "s--", color=TRUTH, markersize=3.5, label="gradient stress")
-        axis.axvline(case["chosen"] / case["nyquist"], color=GUIDE, linewidth=0.8)
-        axis.set(yscale="log", xlabel="k_c / Nyquist wavenumber", title=name)
-        axes[0, -1].plot(case["iterations"], case["by_iterations"], "o-", markersize=3.5,
+        axis.axvline(case["chosen"] / case["nyquist"], color=GUIDE, linewidth=0.8, label="the choice")
+        axis.set(yscale="log", xlabel="$k_c$ / Nyquist wavenumber", title=name)
+        axes[0, -1].plot(case["iterations"], case["by_iterations"], next(markers), color=DNS, markersize=4,
                          label=name.split(", ")[-1])
     axes[0, 0].set_ylabel("error of the acceleration")
     axes[0, 0].legend()
-    axes[0, -1].set(xscale="log", yscale="log", xlabel="iterations from nothing", title="at the chosen k_c")
+    axes[0, -1].set(xscale="log", yscale="log", xlabel="iterations from zero", title="at the chosen $k_c$")
     axes[0, -1].set_xticks([2, 4, 8, 16, 32, 64], [2, 4, 8, 16, 32, 64])
     axes[0, -1].minorticks_off()
     axes[0, -1].legend(loc="upper right")
