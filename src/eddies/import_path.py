@@ -83,7 +83,8 @@ def users_code(called: Any, problem: type[UserError], hint: str = "") -> Iterato
 
 
 def origins(paths: Iterable[str]) -> dict[str, dict[str, str | None]]:
-    """Return by import path: `version` of its package and `sha256` of its source file, each None if there is none."""
+    """Return a table for each import path: the `version` of its package, None if the package is not installed, and the
+    `sha256` of its source file, None if there is no such file."""
     return {path: {"version": _version(path), "sha256": _source_digest(path)} for path in sorted(set(paths))}
 
 

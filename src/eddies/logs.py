@@ -48,12 +48,12 @@ class Output:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        """Write a text. `end` reports an error."""
+        """Write a text. Raises nothing; `end` reports a failure later."""
         self._try(lambda: self._stream.write(text))
         return len(text)
 
     def flush(self) -> None:
-        """Flush the stream. `end` reports an error."""
+        """Flush the stream. Raises nothing; `end` reports a failure later."""
         self._try(self._stream.flush)
 
     def end(self) -> str | None:

@@ -158,7 +158,8 @@ class PlaneCopies(_Copies):
             yield
 
     def unpack(self, rows: _Array, blocks: _Blocks, component: int, planes: slice) -> None:
-        """Copy the modes of some planes, times 2, from the output of the transform along y to a component of blocks."""
+        """Store the modes of some `planes`, found in the output `rows` of the transform along y, in a component of
+        blocks. The stored values are twice the modes."""
         self._unpack(ctypes.byref(blocks), component, planes.start, planes.stop - planes.start, self._cells,
                      rows.shape[-1], rows.address)
 

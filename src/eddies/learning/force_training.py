@@ -328,6 +328,6 @@ class ForceTrainer:
         return kullback_leibler(expected, predicted) / self.comm.size
 
     def _in_cube(self, points: Tensor, corner: np.ndarray, side: float) -> Tensor:
-        """Rows of the points (m, 3) in a periodic cube."""
+        """Indices of those points (m, 3) that lie in a cube. The cube may extend across faces of the periodic box."""
         offset = (points - torch.from_numpy(corner).to(points.device)) % self.length
         return torch.nonzero((offset < side).all(1)).squeeze(1)

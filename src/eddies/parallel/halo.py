@@ -93,7 +93,10 @@ class PlaneHalo:
         return [from_below, planes, from_above]
 
     def parts(self, planes: np.ndarray) -> list[np.ndarray]:
-        """Return planes (c, z_local, ...) between ghost planes of zeros, to be filled for `adjoint`."""
+        """Return what `adjoint` takes: ghost planes of zeros, `planes` (c, z_local, ...), and ghost planes of zeros.
+
+        The caller adds its values to these arrays before it calls `adjoint`.
+        """
         below, above = (np.zeros((len(planes), count, *planes.shape[2:]), planes.dtype)
                         for count in (self.below, self.above))
         return [below, planes, above]

@@ -44,12 +44,12 @@ class Integrator:
 
 
 class VelocityVerlet(Integrator):
-    """Kick-drift-kick velocity Verlet of second order, one evaluation of the rates a step.
+    """Kick-drift-kick velocity Verlet of second order, with one evaluation of the rates per step.
 
-    Rates may depend on velocity and density. They are evaluated with the velocity v + dt a, and the density, that an
-    Euler step predicts for the end of the step (Groot and Warren 1997, lambda = 1). The first half kick of the next
-    step uses the same rates. A density with a rate is integrated by the trapezoidal rule; a density that terms give is
-    the last one evaluated. The shift velocity is that at the start of the step, which is accurate to first order.
+    Rates may depend on velocity and density. An Euler step predicts both for the end of the step, and the rates are
+    evaluated with the predicted values (Groot and Warren 1997, lambda = 1). The first half kick of the next step uses
+    the same rates. A density with a rate is integrated by the trapezoidal rule. If terms give the density itself, the
+    last evaluated value is kept. The shift velocity is that at the start of the step, which is accurate to first order.
     """
 
     scheme = SCHEMES["verlet"]

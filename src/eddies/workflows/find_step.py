@@ -62,10 +62,11 @@ class Stretch:
     Parameters
     ----------
     interval, every : the frame interval of the rollout, in units of time and in frames of the ground truth.
+    name : words for the log, empty if there is one ground truth.
     """
 
-    def __init__(self, truth: GroundTruth, interval: float, every: int) -> None:
-        self.truth, self.turnover = truth, float(truth.reference["eddy_turnover_time"])
+    def __init__(self, truth: GroundTruth, interval: float, every: int, name: str) -> None:
+        self.truth, self.turnover, self.name = truth, float(truth.reference["eddy_turnover_time"]), name
         self.frame = min((frame for frame in truth.state_frames if frame > 0), default=1)
         most = (len(truth.times) - 1 - self.frame) // every
         if most < 1:
@@ -158,11 +159,10 @@ class Ladder:
         whole, half = self[rung], self[rung + 1]
         if not whole.distance(half) < half.tolerance:
             return False
-        for number, stretch in enumerate(self._stretches[1:], 1):
+        for stretch in self._stretches[1:]:
             coarser, finer = (self._tried(stretch, trial.step) for trial in (whole, half))
             if not coarser.distance(finer) < finer.tolerance:
-                log.info("find-step: %s %.4g has not converged on ground truth %d of %d", self.integrator,
-                         whole.step.size, number + 1, len(self._stretches))
+                log.info("find-step: %s %.4g has not converged%s", self.integrator, whole.step.size, stretch.name)
                 return False
         return True
 
@@ -216,7 +216,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 raise SceneError(f"{scene.name}: [simulation] confirmed_on: {path} holds {truth.total} particles, not "
                                  f"{truths[0].total}; name runs with the same number of particles")
         every = round(settings.frame_interval / scene.tracers.frame_interval)
-        stretches = [Stretch(truth, settings.frame_interval, every) for truth in truths]
+        stretches = [Stretch(truth, settings.frame_interval, every,
+                             f" on ground truth {number} of {len(truths)}" if len(truths) > 1 else "")
+                     for number, truth in enumerate(truths, 1)]
         span = float(stretches[0].stops[-1])
         ladders = [Ladder(tried, stretches, *integrator) for integrator in integrators(settings, span)]
         best = cheapest(ladders)
@@ -265,11 +267,12 @@ def short_rollout(method: Method, step: TimeStep, stretch: Stretch, stop: StopRe
             complaint = method.advance(until, number)
     seconds = comm.bcast((time.perf_counter() - began) * stretch.turnover / max(method.time, 1e-300))
     if complaint is not None:
-        log.info("find-step: %s %.4g is unstable: %s", step.integrator, step.size, complaint)
+        log.info("find-step: %s %.4g%s is unstable: %s", step.integrator, step.size, stretch.name, complaint)
         return Trial(stretch, step, seconds)
     particles, _ = method.frame(float(stretch.stops[-1]))
     columns = particles.to_numpy()
     velocity = IdOrder(comm, columns["id"], total).apply(columns["velocity"])
     trial = Trial(stretch, step, seconds, velocity)
-    log.info("find-step: %s %.4g: error %.4f, %.3g s per turnover", step.integrator, step.size, trial.error, seconds)
+    log.info("find-step: %s %.4g%s: error %.4f, %.3g s per turnover", step.integrator, step.size, stretch.name,
+             trial.error, seconds)
     return trial

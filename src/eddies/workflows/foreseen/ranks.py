@@ -87,8 +87,10 @@ def horizon_limits(horizons: Horizons | None, tracers: Tracers, velocity: float,
 
 def truth_limits(path: Path, horizons: Horizons | None, tracers: Tracers, neighbors: float,
                  needs_resolved_velocity: bool) -> dict[str, int]:
-    """Limits on the number of ranks from the training on a ground truth of another run, which may have another number
-    of particles; empty if the file is missing."""
+    """Limits on the number of ranks, by reason, if the model is trained on the ground truth at `path` of another run.
+
+    That ground truth may have another number of particles than `tracers`. Empty if there is no such file.
+    """
     reference = product_attributes(path, "reference")
     if "spacing" not in reference:
         return {}

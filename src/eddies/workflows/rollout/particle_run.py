@@ -185,11 +185,11 @@ class ParticleRun:
 
 
 def forcing_of(power: str | float, section: ForcingSection | None, truth: GroundTruth) -> Forcing | None:
-    """The forcing of a rollout, None without one.
+    """The forcing of a rollout, or None if the rollout is not forced.
 
-    `power` is [simulation] injection: "truth" means the forcing of the ground truth, "dissipation" a power equal to its
-    dissipation rate, a number the power per mass, "none" no forcing. `section` is [forcing] of the scene: for
-    "dissipation" and numbers it sets the limit of the forced wavenumbers, which is 2 without it.
+    `power` is the key `injection` of [simulation]. "truth" gives the forcing of the ground truth, "none" gives no
+    forcing, and a number is the power per mass. "dissipation" gives the dissipation rate of the ground truth. The
+    forced wavenumbers are those of `section`, [forcing] of the scene; without such a section they are below 2.
     """
     if power == "truth":
         return truth.forcing
