@@ -216,8 +216,10 @@ class KernelNetwork(nn.Module):
                              self.mean_volume)
 
     def integral(self, knots: int = KNOTS) -> Tensor:
-        """Integral of the kernel over space before normalisation: 1/alpha of a positive kernel. The loss of Eq. 11 brings
-        the integral of a signed kernel near one."""
+        """Integral of the kernel over space before normalisation: 1/alpha for a positive kernel.
+
+        The loss of Eq. 11 brings the integral of a signed kernel near one.
+        """
         return integral(self._unnormalised(knots))
 
     def table(self, knots: int = KNOTS) -> HermiteKernel:
