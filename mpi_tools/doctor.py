@@ -72,7 +72,7 @@ def ring_bandwidth(comm: MPI.Comm) -> tuple[float, list[str]]:
 
 
 def parallel_file(comm: MPI.Comm) -> list[str]:
-    """Return complaints about a file in the current folder that all ranks write together."""
+    """Write a file in the current folder, all ranks together, and read it. Return complaints about its content."""
     import h5py
     number = np.array([os.getpid()])  # a name of its own for each run, the same on all ranks
     comm.Bcast(number)

@@ -1,7 +1,7 @@
 """Start a command on this machine's cores under `mpirun`, with the environment that it needs.
 
-SIGTERM, SIGUSR1, SIGINT and, unless it is ignored, SIGHUP reach the ranks as SIGUSR1, so that they can stop in order.
-A second signal other than SIGUSR1 ends the job at once.
+SIGTERM, SIGUSR1, SIGINT and SIGHUP, unless they are ignored, reach the ranks as SIGUSR1, so that the ranks can end
+their work properly. A second signal other than SIGUSR1 ends the job at once.
 
     python mpi_tools/launch.py [-n RANKS] -- COMMAND...
 
@@ -22,8 +22,8 @@ from pathlib import Path
 sys.path.append(str(Path(__file__).parents[1] / "src"))  # of this checkout, if eddies is not installed yet
 from eddies.cores import check_threads, default_to_one_thread, is_positive, local_cores, threads  # noqa: E402
 
-# The line above and below a notice of mpirun, how notices about a non-zero exit code begin, and the exit codes whose
-# reason the ranks have printed themselves: bad input, stopped, interrupted.
+# RULE is the line above and below a notice of mpirun. NOTICES are beginnings of notices about a non-zero exit code. The
+# ranks have printed the reason of a code in EXPLAINED themselves: bad input, stopped, interrupted.
 RULE = b"-" * 74
 NOTICES = (b"Primary job  terminated normally", b"mpirun detected that one or more processes exited with non-zero",
            b"prterun detected that one or more processes exited with non-zero")
@@ -81,7 +81,7 @@ class ErrorOutput:
         self._line, self._frame, self._held, self._said, self._midway = b"", [], b"", False, False
 
     def pass_on(self, content: bytes) -> bytes:
-        """Return the bytes to write now. Notices, and a line with which one may begin, are held back."""
+        """Return the bytes to write now. Notices, and lines that may begin a notice, are held back."""
         *lines, self._line = (self._line + content).split(b"\n")
         passed = b"".join(self._pass_line(line + b"\n") for line in lines)
         if self._line and not self._frame and not RULE.startswith(self._line):
@@ -99,7 +99,7 @@ class ErrorOutput:
             return line
         self._frame.append(line)
         first, *others = self._frame
-        if len(others) == 1 and line.rstrip() == RULE:  # the end of another frame, and the start of this one
+        if len(others) == 1 and line.rstrip() == RULE:  # `first` ends another notice, and `line` begins one
             self._frame, self._said = [line], True
             return first
         if first.rstrip() != RULE or others and not others[0].startswith(NOTICES):
@@ -126,7 +126,7 @@ def pass_errors_on(job: subprocess.Popen) -> None:
 def run_job(line: list[str], environment: dict[str, str]) -> int:
     """Run mpirun to its end. Return its exit code, or 128 plus the number of the signal that ended it.
 
-    mpirun kills its ranks soon after a SIGTERM and returns a code of its own. It only forwards SIGUSR1 to the ranks.
+    mpirun kills its ranks soon after a SIGTERM and returns a code of its own. A SIGUSR1 is only forwarded to them.
     """
     terminations: list[int] = []
 

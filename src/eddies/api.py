@@ -42,8 +42,8 @@ def run(scene: Scene | str | Path, *, stages: Sequence[str] | None = None, outpu
     ----------
     stages : names such as "dns" and "train-kernel"; run in the order of the pipeline. None: all stages of the scene.
     output : the run directory.
-    overwrite : replace work of other settings; if it is False, such work is an error. Complete products of the same
-        settings are always kept.
+    overwrite : replace products and checkpoints that were made with other settings; if False, they are an error.
+        Complete products of the same settings are always kept.
     variants : the variants to run; empty for all.
     comm : the communicator; None for all ranks of the job.
 
@@ -78,7 +78,7 @@ def simulate(scene: Scene | str | Path, *, output: str | Path | None = None, ove
 
 @contextmanager
 def _job(comm: Comm | None) -> Iterator[Comm]:
-    """The communicator of a job, by default the one of all ranks.
+    """Context that gives the communicator of a job, by default the one of all ranks.
 
     Log lines go to standard output unless the program has set up logging. With several ranks, MPI_Abort ends the job
     in two cases. Either only some ranks meet an error, and the others may wait for them. Or HDF5 could not write a

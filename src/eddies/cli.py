@@ -90,7 +90,7 @@ def run(arguments: list[str] | None) -> int:
         require_connected(MPI.COMM_WORLD)
     except NotConnected as error:
         if not error.first:
-            time.sleep(PATIENCE)  # launchers kill all ranks when one ends, but the first must report
+            time.sleep(PATIENCE)  # launchers kill all ranks when one ends, so the first rank must report before
         else:
             complain(f"error: {error}")
         return BAD_INPUT
@@ -124,7 +124,7 @@ def run(arguments: list[str] | None) -> int:
 
 
 def complain(text: str, prefix: str = "eddies: ") -> None:
-    """Write the lines of a message to standard error, which may be a closed pipe or a file on a full disk."""
+    """Write the lines of a message to standard error. A failed write, as to a closed pipe, raises nothing."""
     with contextlib.suppress(OSError):
         sys.stdout.flush()
         sys.stderr.write("".join(f"{prefix}{line}\n" for line in text.split("\n")))
@@ -192,7 +192,7 @@ def end_with_error(error: BaseException, comm: Comm) -> int:
     code = INTERRUPTED if interrupted else BAD_INPUT if mistake else 1
     broken = writing_failed()
     if broken and together:
-        all_arrive(comm)  # after the message of rank 0
+        all_arrive(comm)  # waits until rank 0 has written its message
     if broken or not together:
         comm.Abort(code)
     return code

@@ -136,7 +136,7 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_variants(parser: argparse.ArgumentParser, about: str) -> None:
-    """Add the choice of variants by name."""
+    """Add the option --variant, which names a variant; `about` is its help."""
     parser.add_argument("--variant", action="append", default=[], metavar="NAME", dest="variants", help=about)
 
 

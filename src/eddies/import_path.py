@@ -28,7 +28,7 @@ def is_path(name: str) -> bool:
 
 
 def short_name(name: str) -> str:
-    """Return the name for sections of a scene and for logs: a built-in name, or the part of a path after the colon."""
+    """Return the name that scene sections and logs use: a built-in name, or the part of a path after the colon."""
     return name.rpartition(":")[2]
 
 
@@ -62,10 +62,10 @@ def load(path: str) -> Any:
 
 @contextmanager
 def users_code(called: Any, problem: type[UserError], hint: str = "") -> Iterator[None]:
-    """Convert an exception of `called`, a user's class or function, into the error `problem` with name, file and line.
+    """Convert an exception of `called`, a user's class or function, into an error of type `problem`.
 
-    An exception passes unchanged if its type or `called` belongs to this package, or if it is a MemoryError. `hint` is
-    added to the end of the text.
+    The text of the error names `called`, the file and the line, and ends with `hint`. A UserError or MemoryError passes
+    unchanged. So does any other exception if its type or `called` belongs to this package.
     """
     try:
         yield

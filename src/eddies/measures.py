@@ -32,7 +32,7 @@ MEASURES = {
     "count_variance": "variance of counts / that of random points",
     "count_variance_floor": "variance of counts of the true tracers",
 }
-#: Measures in the figure of variants, and measures in the table of variants.
+#: Measures in the figure (DRAWN) and in the table (SHOWN) of variants.
 DRAWN = ("velocity_error_early", "velocity_error_half", "spectrum_error", "acceleration_kl")
 SHOWN = ("velocity_error_early", "velocity_error_half", "velocity_error_end", "spectrum_error", "energy_ratio",
          "velocity_kl", "velocity_kl_floor", "acceleration_kl", "acceleration_kl_floor", "qr_kl", "qr_kl_floor",

@@ -55,8 +55,8 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
 
     Raises:
         Stopped: `stop` requested it; the running stage has stored what the next run needs.
-        SceneError: a file STOP is present at the start, or the scene lacks a section, cannot use as many ranks, makes
-            too large a file for rank 0 to write, or has other settings than an input was made with.
+        SceneError: a file STOP is present at the start, or the scene lacks a section, cannot use this number of ranks,
+            needs a file that is too large for rank 0 to write, or has settings that differ from those of an input.
         RunInUse, RunTakenOver: another job works in the directory, or has taken it over.
         WouldReplaceWork: work of other settings would be replaced.
         WriteError: the directory cannot be written.
@@ -108,7 +108,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
 
 def run_steps(planned: Sequence[Step], comm: Comm, directory: Path, stop: StopRequest, overwrite: bool,
               take_over: bool) -> dict[str, str]:
-    """Run the steps of a run directory whose lock is held. Returns the error of each failed variant by name."""
+    """Run steps in a run directory whose lock is held. Returns the error of each failed variant, by variant name."""
     failures: dict[str, str] = {}
     errors = comm.Dup()  # other ranks may wait in `comm` for a message when one rank fails
     for number, step in enumerate(planned, 1):
@@ -166,8 +166,8 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
 
 
 def checked_work(step: Step, comm: Comm, overwrite: bool) -> Work:
-    """Return the work in the directory of a step. Raises WouldReplaceWork if it would be replaced and `overwrite` is
-    false."""
+    """Return what the directory of a step holds. Raises WouldReplaceWork if the step would replace files there
+    and `overwrite` is false."""
     work = in_files(comm, step.directory, lambda: find_work(
         [*step.links, *step.stages], step.scene, step.directory, step.links))
     if not overwrite:

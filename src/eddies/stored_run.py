@@ -189,7 +189,7 @@ def variant_directory(path: Path, name: str) -> Path:
 
 
 def chosen(table: dict[str, Any], of: str) -> Any:
-    """The entry `of` of a table. Raises UserError, which gives the valid names, if there is no such entry."""
+    """The entry of a table with the name `of`. Raises UserError, which lists the valid names, if there is none."""
     if of not in table:
         raise UserError(f'of = "{of}": must be one of {", ".join(table)}')
     return table[of]

@@ -13,12 +13,13 @@ from eddies.measures import MEASURES
 
 
 def accuracy(run: Rollout) -> dict[str, float | None]:
-    """Measures of a rollout, by the keys of MEASURES, and `end`, the last common time divided by the turnover time T.
+    """Return each measure of a rollout under its key in MEASURES, and under `end` the last common time / T.
 
-    A measure is None if the rollout or the truth does not reach its time. Velocity errors are normalised L2 errors over
-    all particles; those at t_eta and T/2 are interpolated linearly between frames. Measures at the end are taken at the
-    last common frame, and Lagrangian statistics over all common frames. Both groups are None for a rollout that stops
-    early or has a frame that is not finite, because it ends earlier than the rollouts it is compared with.
+    T is the turnover time. A measure is None if its data are missing, for example because the rollout or the truth ends
+    too early. Velocity errors are normalised L2 errors over all particles; those at t_eta and T/2 are interpolated
+    linearly between frames. Measures at the end are taken at the last common frame, Lagrangian statistics over all
+    common frames. Both groups are None for a rollout that stops early or has a frame that is not finite, because it
+    ends earlier than the other rollouts.
     """
     measures: dict[str, float | None] = dict.fromkeys(MEASURES)
     try:

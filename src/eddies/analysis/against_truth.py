@@ -32,7 +32,7 @@ def error_series(run: Rollout) -> dict[str, np.ndarray]:
     """Time series over the common frames, by name: time, velocity_error, velocity_kl, acceleration_kl, no_force.
 
     `velocity_error` is the normalised L2 error. `no_force` is this error for particles that keep the true velocity of
-    the first common frame.
+    the first common frame. `velocity_kl` and `acceleration_kl` are values of `pdf_divergence`.
     """
     rows, first = [], run.pair(0, "velocity").truth
     for index in range(run.common.times.size):
@@ -45,8 +45,8 @@ def error_series(run: Rollout) -> dict[str, np.ndarray]:
 
 
 def pdf_divergence(pair: Pair, edges: np.ndarray) -> float:
-    """Forward KL divergence between the PDFs of truth and model, each PDF over all components. Both are standardised
-    with the mean and the standard deviation of the truth."""
+    """Forward KL divergence between the PDFs of truth and model, each over the values of all components. The values of
+    both are standardised with the mean and the standard deviation of the truth."""
     return kl_divergence(bin_probabilities(standardized(pair.truth), edges),
                          bin_probabilities(standardized(pair.model, pair.truth), edges))
 
@@ -71,7 +71,7 @@ class InvariantStatistics:
 
     @classmethod
     def of(cls, model: Invariants, truth: Invariants) -> "InvariantStatistics":
-        """Joint PDFs of (Q, R). The truth's <Q_w> is the unit of both, so that a wrong amplitude of the model shows."""
+        """Joint PDFs of (Q, R), scaled with <Q_w> of the truth in both runs, so that a wrong model amplitude shows."""
         model_plane, truth_plane = (run.normalized(truth.scale) for run in (model, truth))
         bins = InvariantBins.covering(*truth_plane)
         floor = sampling_divergence(len(truth.second),
@@ -92,7 +92,8 @@ def last_invariants(run: Rollout) -> InvariantStatistics:
 def conditional_flows(run: Rollout, bins: InvariantBins) -> tuple[ConditionalVelocity, ConditionalVelocity] | None:
     """Conditional mean (dQ/dt, dR/dt) of model and truth over all common frames; None with fewer than two frames.
 
-    The units of Q, R and their rates are powers of the truth's <Q_w>, averaged over the two frames of a difference.
+    Rates are finite differences between successive frames. The units of Q, R and the rates are powers of the truth's
+    <Q_w>, averaged over the two frames.
     """
     times = run.common.times
     if times.size < 2:

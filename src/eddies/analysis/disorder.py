@@ -12,10 +12,10 @@ from eddies.analysis.lagrangian import evenly, neighbor_pairs
 from eddies.analysis.pdfs import bin_probabilities
 from eddies.analysis.rollout import Frames, Rollout
 
-# Bins of the PDF of nearest-neighbour distances, in mean spacings; a share exp(-14) of random points lies beyond.
+# Bins of the PDF of nearest-neighbour distances, in mean spacings; for random points a share exp(-14) lies beyond.
 DISTANCE_EDGES = np.linspace(0, 1.5, 31)
 SAMPLED = 2**15  # largest number of particles whose nearest neighbour is searched
-PAIRS = 2**22  # about the largest number of pairs found in one search, if particles have clustered
+PAIRS = 2**22  # one search finds at most about this number of pairs, even if particles have clustered
 CELL = 2.0  # side of the cells in which particles are counted, in mean spacings: about a filter width
 
 

@@ -20,8 +20,8 @@ def normalized_l2(prediction: np.ndarray, truth: np.ndarray) -> float:
 def rms_log_ratio(prediction: np.ndarray, truth: np.ndarray) -> float:
     """Root mean square of ln(prediction / truth) over all entries.
 
-    It is a if every prediction is wrong by a factor e^a or e^-a, not finite if an entry is not positive, and NaN
-    without entries.
+    If every prediction is wrong by a factor e^a or e^-a, a > 0, the result is a. It is not finite if a ratio is not
+    positive, and NaN without entries.
     """
     prediction, truth = np.asarray(prediction, dtype=float), np.asarray(truth, dtype=float)
     if prediction.size == 0:

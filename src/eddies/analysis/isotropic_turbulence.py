@@ -148,8 +148,8 @@ class StationarySpan:
     def compensated_spectrum(self) -> tuple[np.ndarray, np.ndarray]:
         """k eta and eps^(-2/3) k^(5/3) E(k) of the mean spectrum, for k = 1 to the last complete shell.
 
-        The number of modes in a shell differs from 4 pi k^2: at k = 1 it is 18 instead of 12.6. So E(k) is here the
-        mean energy of a mode of the shell times 4 pi k^2.
+        The number of modes in a shell differs from 4 pi k^2: at k = 1 it is 18 instead of 12.6. So E(k) is here
+        4 pi k^2 times the mean energy per mode of the shell.
         """
         cutoff = int(np.rint(self.columns["kmax_eta"][-1] / self.columns["kolmogorov_length"][-1]))
         k = np.arange(1, cutoff + 1)
@@ -216,7 +216,7 @@ def comparison(span: StationarySpan) -> list[Row]:
 
 
 def _spectrum_rows(span: StationarySpan) -> list[Row]:
-    """Rows for mean and maximum of the compensated spectrum, each only if shells lie in its range of k eta."""
+    """Rows for mean and maximum of the compensated spectrum; each needs an unforced shell in its range of k eta."""
     k_eta, compensated = span.unforced()
     inertial = compensated[(k_eta >= INERTIAL[0]) & (k_eta <= INERTIAL[1])]
     constant = "{}–{}, more in a bottleneck".format(*KOLMOGOROV_CONSTANT)

@@ -58,23 +58,23 @@ def of_both(model: Frames, truth: Frames, common: CommonFrames,
 
 
 def evenly(total: int, most: int) -> np.ndarray:
-    """At most `most` of the rows 0 ... total - 1, evenly spread from the first to the last."""
+    """Row numbers, evenly spread from 0 to total - 1: all of them, or `most` if there are more."""
     return np.unique(np.linspace(0, total - 1, min(total, most)).astype(int))
 
 
 def lags_of(longest: int) -> np.ndarray:
-    """At most LAGS lags in frames, from 1 to `longest`, about evenly spread in the logarithm."""
+    """Lags, counted in frames: at most LAGS integers from 1 to `longest`, about evenly spread in the logarithm."""
     return np.unique(np.rint(np.geomspace(1, longest, LAGS)).astype(int)) if longest else np.empty(0, int)
 
 
 def near_tetrads(position: np.ndarray, length: float) -> np.ndarray:
-    """Tetrads as rows (4, m) of positions (n, 3): at most TETRADS particles, each with its three nearest neighbours."""
+    """Row numbers (4, m) in `position` (n, 3) of at most TETRADS particles, each with its 3 nearest neighbours."""
     chosen = evenly(len(position), TETRADS)
     return np.concatenate([chosen[None], nearest_rows(position, length, chosen, CORNERS - 1)])
 
 
 def path_statistics(run: Frames, chosen: Sequence[int], tetrads: np.ndarray, length: float) -> PathStatistics:
-    """Statistics of the chosen frames of a run; `tetrads` (4, g) are rows of the run's particles."""
+    """Statistics of the chosen frames of a run; `tetrads` (4, g) holds row numbers of its particles."""
     chosen = [int(frame) for frame in chosen]
     times = run.times[chosen] - run.times[chosen[0]]
     velocity, acceleration = (_sample(run, chosen, column) for column in ("velocity", "acceleration"))
@@ -116,7 +116,7 @@ def _sample(run: Frames, chosen: Sequence[int], column: str) -> np.ndarray:
 
 def _dispersion(run: Frames, chosen: Sequence[int], tetrads: np.ndarray,
                 length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Dispersion (m,) of pairs of the first two corners, size (m,) and shape (m, 3) of tetrads, in chosen frames."""
+    """Pair dispersion (m,) of the first two corners of tetrads, tetrad size (m,) and shape (m, 3) in chosen frames."""
     first = np.tile(tetrads[0], CORNERS - 1)
     paths = separations((run.read(frame, "position") for frame in chosen), tetrads[1:].ravel(), first, length)
     pairs, sizes, shapes, start = [], [], [], None
@@ -131,7 +131,7 @@ def _dispersion(run: Frames, chosen: Sequence[int], tetrads: np.ndarray,
 
 
 def tetrad_moments(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Size R^2 (g,) and shape (g, 3) of tetrads (4, g, 3).
+    """Size R^2 (g,) and shape (g, 3) of tetrads with the corners (4, g, 3).
 
     The shape is the eigenvalues of the second moments divided by R^2, the largest first.
     """
@@ -172,7 +172,7 @@ def increment_flatness(velocity: Sequence[np.ndarray], lags: np.ndarray) -> np.n
 
 def _over_lags(values: Sequence[np.ndarray], lags: np.ndarray,
                function: Callable[[np.ndarray, np.ndarray], float]) -> np.ndarray:
-    """Mean over all start frames of a function of the values at two frames, for each lag."""
+    """For each lag, apply `function` to the values of two frames that are a lag apart; average over start frames."""
     return np.array([np.mean([function(earlier, later) for earlier, later in zip(values, values[lag:])])
                      for lag in lags])
 
@@ -184,10 +184,10 @@ def minimum_image(displacement: np.ndarray, length: float) -> np.ndarray:
 
 def separations(position: Iterable[np.ndarray], first: np.ndarray, second: np.ndarray,
                 length: float) -> Iterator[np.ndarray]:
-    """Separations x_first - x_second (m, 3) of pairs, frame by frame, from positions (n, 3) of each frame.
+    """Yield for each frame the separations x_first - x_second (m, 3) of pairs. `position` yields positions (n, 3).
 
     Positions may be wrapped into the box. The first separation is to the nearest image. Later ones are continuous if no
-    component changes by more than length / 2 between frames. `first` and `second` (m,) are rows of the positions.
+    component changes by more than length / 2 between frames. `first` and `second` (m,) hold row numbers of particles.
     """
     separation = 0.0
     for frame in position:
@@ -199,7 +199,7 @@ def separations(position: Iterable[np.ndarray], first: np.ndarray, second: np.nd
 def pair_dispersion(position: Iterable[np.ndarray], groups: Sequence[np.ndarray], length: float) -> np.ndarray:
     """<|r(t) - r(0)|^2> of each group of pairs in each frame, (groups, frames).
 
-    A group is given by the rows (2, m) of its pairs. `position` yields the positions (n, 3) of each frame.
+    A group holds the row numbers (2, m) of its pairs. `position` yields the positions (n, 3) of each frame.
     """
     paths = separations(position, *np.concatenate(groups, axis=1), length)
     start, ends = next(paths), np.cumsum([pairs.shape[1] for pairs in groups])[:-1]
@@ -214,8 +214,8 @@ def neighbor_pairs(position: np.ndarray, length: float, chosen: np.ndarray,
                    radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pairs of a chosen particle and another particle within a radius of it, periodic with `length`.
 
-    `chosen` (m,) are rows of positions (n, 3). Returns for each pair the first particle's index in `chosen`, the row of
-    the other particle, and their distance. The indices are in ascending order.
+    `chosen` (m,) holds row numbers of `position` (n, 3). Returns three arrays over the pairs: index of the first
+    particle in `chosen`, in ascending order; row number of the other particle; distance.
     """
     offsets, rows = neighbors_within(library(), Box(length, True), radius, position[chosen], position, False)
     places = np.repeat(np.arange(chosen.size), np.diff(offsets))
@@ -227,9 +227,9 @@ def neighbor_pairs(position: np.ndarray, length: float, chosen: np.ndarray,
 
 def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], tolerance: float,
              followed: int) -> list[np.ndarray]:
-    """For each distance, rows (2, m) of the pairs of particles (n, 3) at this distance, to a relative `tolerance`.
+    """For each distance, row numbers (2, m) of the particle pairs at this distance within a relative `tolerance`.
 
-    The first particle of a pair is one of the first `followed` rows. Each pair appears once.
+    The first particle of a pair is in the first `followed` rows of `position` (n, 3). Each pair appears once.
     """
     first = np.arange(min(followed, len(position)))
     radius = 1.001 * (1 + tolerance) * max(distances, default=0.0)
@@ -240,9 +240,10 @@ def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], to
 
 
 def nearest_rows(position: np.ndarray, length: float, chosen: np.ndarray, count: int) -> np.ndarray:
-    """Rows (count, m) of the other particles nearest to each chosen row (m,) of positions (n, 3), nearest first.
+    """Row numbers (count, m) of the particles nearest to each chosen particle, nearest first.
 
-    Raises ValueError if there are fewer other particles than `count`.
+    `chosen` (m,) holds row numbers of `position` (n, 3). Raises ValueError if there are fewer other particles than
+    `count`.
     """
     if len(position) <= count:
         raise ValueError(f"{len(position)} particles: at least {count + 1} are needed")

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-Method = Mapping[str, Any]  # `label`; cost and errors, None if unknown; KEY_spread, standard deviation of error KEY
+Method = Mapping[str, Any]  # keys: label; costs and errors (None: unknown); KEY_spread (standard deviation of KEY)
 
 
 def pareto_front(cost: np.ndarray, error: np.ndarray) -> np.ndarray:
@@ -28,7 +28,7 @@ def pareto_front(cost: np.ndarray, error: np.ndarray) -> np.ndarray:
 def verdict(model: Method, others: Sequence[Method], cost: str, measures: Mapping[str, str]) -> list[str]:
     """Two texts: the measures in which the model is worth its cost, and its rivals in the other measures.
 
-    The model is worth its cost in a measure without a rival. A rival is another method that costs no more and is at
+    The model is worth its cost in a measure if it has no rival. A rival is another method that costs no more and is at
     least as accurate. Errors count as equal if they differ by at most the larger of their spreads over realisations.
     A method that lacks the cost or the error is no rival. For each measure, the text names the cheapest rival and the
     number of further ones. Without other methods, there is one text that says so.
@@ -61,8 +61,8 @@ def verdict(model: Method, others: Sequence[Method], cost: str, measures: Mappin
 def cheapest_grid(model: Method, grids: Sequence[Method], cost: str, times: Mapping[str, str]) -> str:
     """A sentence that names the cheapest grid whose velocity error is at most the model's at all `times`.
 
-    `times` maps keys of errors to the times in words. Means over realisations are compared. The sentence is empty if
-    the model lacks a number.
+    `times` maps keys of errors to the times in words. Means over realisations are compared. The sentence is empty
+    without `times`, or if the model's cost or one of its errors is None.
     """
     if not times or None in [model[key] for key in (cost, *times)]:
         return ""
@@ -86,6 +86,6 @@ def break_even(first: float, each: float, rival_first: float, rival_each: float)
 
 
 def _worse(row: Method, model: Method, key: str) -> bool:
-    """Whether the error of a row is larger than the model's by more than the larger spread."""
+    """Whether the error of a row exceeds the model's by more than the larger of the two spreads."""
     spread = max(one.get(f"{key}_spread") or 0.0 for one in (row, model))
     return row[key] > model[key] + spread

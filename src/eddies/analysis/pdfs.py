@@ -44,8 +44,8 @@ def kl_divergence(truth: np.ndarray, prediction: np.ndarray) -> float:
 def sampling_divergence(rows: int, probabilities: Callable[[np.ndarray], np.ndarray]) -> float:
     """Expected divergence between two independent samples of `rows` rows: the value of a perfect model.
 
-    It is estimated as half the divergence between two random halves of the sample, as it decreases as 1 / rows.
-    `probabilities` returns the bin probabilities of chosen rows.
+    The divergence decreases as 1 / rows. So the estimate is half the divergence between two random halves of the
+    sample. `probabilities` maps row numbers to the bin probabilities of these rows.
     """
     shuffled = np.random.default_rng(0).permutation(rows)
     return kl_divergence(*(probabilities(half) for half in np.array_split(shuffled, 2))) / 2

@@ -12,11 +12,11 @@ from eddies.analysis.velocity_gradients import Invariants
 
 SHOWN = 3   # largest number of times at which a report shows spectra of a rollout
 PLANES = 4  # largest number of times at which a report shows planes of a rollout
-Table = Mapping[str, np.ndarray]  # columns by name; of spectra: wavenumber (shells,), time (m,), energy (m, shells)
+Table = Mapping[str, np.ndarray]  # columns by name; spectra have wavenumber (shells,), time (m,), energy (m, shells)
 
 
 class Frames(Protocol):
-    """Particles at several times: `total` of them, in a periodic box of edge `length`."""
+    """`total` particles at several times, in a periodic box of edge `length`."""
 
     times: np.ndarray
     columns: Collection[str]
@@ -61,7 +61,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Plane:
-    """Velocity (3, n, n) and vorticity magnitude (n, n), as [y, x], in the plane z = pi, from particles."""
+    """Velocity (3, n, n) and vorticity magnitude (n, n) in the plane z = pi, from particles; last axes: y, x."""
 
     velocity: np.ndarray
     vorticity: np.ndarray
@@ -97,7 +97,7 @@ class SpectraAt:
 
 @dataclass(frozen=True)
 class Rollout:
-    """A rollout, the true particles, and measures of both, which are read frame by frame.
+    """A rollout, the true particles, and measures of both for single frames.
 
     Parameters
     ----------
@@ -114,7 +114,8 @@ class Rollout:
     planes : for "model" and "truth", a plane of the reconstructed field, by frame. None without a kernel.
     outside_training : share of particle pairs with a network input outside its range in training, (frames,); None if
         it was not counted.
-    closure : columns (frames,) about the solves for the resolved velocity; None if there were none.
+    closure : columns (frames,) `solves`, `iterations`, `most_iterations`, `residual` and `not_converged` of the
+        iterative solves for the resolved velocity; None if there were no solves.
     reconstructed_by : name of the reconstruction method, for captions.
     """
 
@@ -211,10 +212,10 @@ class Rollout:
         return _spread(self.spectral(), SHOWN) if several else self.spectral()[-1:]
 
     def late_spectra(self) -> np.ndarray:
-        """Frame numbers of the model over which its spectrum is averaged, in the second half before `broken`.
+        """Frame numbers of the model over which its spectrum is averaged, in the second half of the time to `broken`.
 
         A frame is used if the spectrum of the flow is stored at its time, or if the truth has no frame at this time.
-        If the second half has no such frame, the last such frame before it is used.
+        If the second half has no such frame, the last such frame of the first half is used.
         """
         times = self.model.times
         chosen = self._has_flow(times) | ~_contained(times, self.truth.times)

@@ -15,7 +15,7 @@ def spectrum_error(energy: np.ndarray, reference: np.ndarray, largest_wavenumber
 
 
 def band_ratios(energy: np.ndarray, reference: np.ndarray, largest_wavenumber: float) -> dict[str, float]:
-    """Ratio of `energy` to `reference` in bands of shells up to `largest_wavenumber`, by "1-2", "3-4", "5-8", ..."""
+    """Ratio of `energy` to `reference` in the bands of shells "1-2", "3-4", "5-8", ... up to `largest_wavenumber`."""
     last, ratios, first, end = _last_shell(largest_wavenumber), {}, 1, 2
     while first <= last:
         end = min(end, last)

@@ -84,7 +84,7 @@ def first_exponent(x: np.ndarray, y: np.ndarray) -> float:
 def tracer_statistics(tracers: Frames, spectra: Mapping[str, np.ndarray], spacing: float) -> TracerStatistics:
     """Measure tracers of mean distance `spacing` in frames at equal intervals.
 
-    `spectra` holds `time` (m,) and `filtered` (m, shells).
+    `spectra` holds `time` (m,) and `filtered` (m, shells), the energy spectra of the filtered flow.
     """
     times, every = tracers.times, -(-tracers.total // FOLLOWED)
     velocity = np.stack([tracers.read(frame, "velocity")[::every] for frame in range(times.size)])
@@ -110,7 +110,7 @@ def _energy_ratio(tracers: Frames, spectra: Mapping[str, np.ndarray]) -> tuple[n
 def _accelerations(velocity: np.ndarray) -> tuple[np.ndarray, float]:
     """PDF and kurtosis of accelerations, both averaged over the intervals between frames.
 
-    The average keeps the decay of the flow from widening the tails.
+    Each interval is scaled with its own rms, so that the decay of the flow does not widen the tails.
     """
     probability, kurtosis = [], []
     for earlier, later in zip(velocity, velocity[1:]):

@@ -51,8 +51,8 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
     ----------
     time, track : (rows,), in any order. position : (rows, 3), wrapped or not.
     edge : edge of a periodic cube, or None. Particles must move by less than half an edge between rows of a track.
-    noise : standard deviation of the error of a coordinate. It determines mu: the sum of the squared residuals is
-        noise^2 times its degrees of freedom.
+    noise : standard deviation of the error of a measured coordinate. It determines mu: the sum of the squared
+        residuals is then noise^2 times the number of degrees of freedom.
     """
     order = np.lexsort((time, track))
     ends = np.flatnonzero(np.diff(track[order], append=track[order][-1] - 1)) + 1
@@ -87,7 +87,7 @@ class Fit:
         self._penalty = interval**5 * jerk.T @ dia_array((np.diff(times)[None], [0]), shape=[len(times) - 1] * 2) @ jerk
 
     def spline(self, smoothing: float, values: np.ndarray | None = None) -> BSpline:
-        """The splines for mu = `smoothing` of `values` (n, columns), by default the positions."""
+        """The splines that approximate `values` (n, columns), by default the positions, with mu = `smoothing`."""
         matrix = self._basis.T @ self._basis + smoothing * self._penalty
         bands = np.zeros((DEGREE + 1, matrix.shape[0]))
         for offset in range(DEGREE + 1):
@@ -96,7 +96,7 @@ class Fit:
         return BSpline(self._knots, solveh_banded(bands, right, lower=True), DEGREE)
 
     def residual(self, smoothing: float) -> tuple[float, float]:
-        """Sum of squared residuals, and its degrees of freedom: values minus the trace of the smoother matrix."""
+        """Sum of squared residuals, and its degrees of freedom: number of values minus trace of the smoother matrix."""
         squares = float(np.sum((self.spline(smoothing)(self.times) - self._values) ** 2))
         influence = self.spline(smoothing, np.eye(len(self.times)))(self.times)
         return squares, 3 * self.tracks * (len(self.times) - float(np.trace(influence)))

@@ -9,7 +9,7 @@ def invariants(gradient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Q = -1/2 Tr(A* A*) and R = -1/3 Tr(A* A* A*), A* = A - 1/3 Tr(A) I, A_ij = dv_i/dx_j: (..., 3, 3) -> (...)."""
     trace = np.trace(gradient, axis1=-2, axis2=-1)
     traceless = gradient - trace[..., None, None] / 3 * np.eye(3)
-    # Components first: passes over particles take half the time of products of many small matrices.
+    # The axes of components come first: loops over particles take half the time of products of many small matrices.
     traceless = np.ascontiguousarray(np.moveaxis(traceless, (-2, -1), (0, 1)))
     squared = np.einsum("ik...,kj...->ij...", traceless, traceless)
     return -np.trace(squared) / 2, -np.einsum("ij...,ji...->...", squared, traceless) / 3
@@ -54,7 +54,7 @@ class InvariantBins:
 
     @classmethod
     def covering(cls, second: np.ndarray, third: np.ndarray, quantile: float = 0.999) -> "InvariantBins":
-        """Bins of symmetric ranges of Q and of R that each hold the fraction `quantile` of the sample.
+        """Equal bins over |Q| < Q_m and |R| < R_m. Each range holds the fraction `quantile` of the sample.
 
         The number of bins per axis is the cube root of the sample size, but between 12 and 64.
         """

@@ -12,7 +12,7 @@ SILENT = {"float64": 1e-20, "float32": 1e-10}
 
 
 class LinearForcing:
-    """Force f(k) = A u_s(k) for 0 < |k| < `wavenumber`, with A = rate / sum |u_s|^2, so that <u.f> = `injection_rate`.
+    """Force f(k) = A u_s(k) for 0 < |k| < `wavenumber`, with A = P / sum |u_s|^2, so that <u.f> = P = `injection_rate`.
 
     u_s is the solenoidal part of the velocity. This is the form of Lundgren (2003) and of Petersen and Livescu (2010);
     A is computed at every evaluation. If the velocity has passed a Gaussian filter of `filter_width`, the sum uses the
@@ -35,7 +35,7 @@ class LinearForcing:
         self._forced = (squared > 0) & (squared < wavenumber**2)
         unit = 2 * np.pi / grid.decomposition.length
         self._weights = np.where(kx == 0, 1, 2) / gaussian_transfer(unit**2 * squared, filter_width) ** 2
-        # Rows of ky of the forced modes, in this rank's array and in the block of all forced modes.
+        # Indices along ky of the forced modes: in this rank's array, and in the block of all forced modes.
         own_ky = grid.index[1].ravel()
         self._own_rows = np.flatnonzero(np.abs(own_ky) <= reach)
         self._block_rows = own_ky[self._own_rows] + reach

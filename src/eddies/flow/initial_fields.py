@@ -45,7 +45,7 @@ def _with_spectrum(grid: SpectralGrid, velocity: np.ndarray, energy: np.ndarray,
 
 
 def _gaussian_modes(grid: SpectralGrid, seed: int) -> np.ndarray:
-    """Return complex normal numbers (3, kz, ky, kx), conjugate in mirror modes."""
+    """Return complex normal numbers (3, kz, ky, kx); those of mirror modes k and -k are conjugate."""
     def line(ky: int, kz: int) -> np.ndarray:
         # Negative wavenumbers are folded to odd numbers, because seeds must not be negative.
         fold = [2 * k if k >= 0 else -2 * k - 1 for k in (ky, kz)]
@@ -101,7 +101,7 @@ def balanced_density(grid: SpectralGrid, velocity: np.ndarray, sound_speed: floa
     return grid.pressure_of(grid.squares(velocity)) / sound_speed**2
 
 
-#: Functions that return the initial velocity, by [initial] kind. Arguments: grid, section [initial], seed.
+#: Functions that return the initial velocity, by the key `kind` of [initial]. Arguments: grid, section [initial], seed.
 INITIAL_FLOWS = {
     "random": lambda grid, initial, seed: random_velocity(grid, seed, initial.amplitude, initial.peak_wavenumber),
     "taylor-green": lambda grid, initial, seed: taylor_green(grid, initial.amplitude),
@@ -112,6 +112,6 @@ INITIAL_FLOWS = {
 
 
 def _modes(grid: SpectralGrid, amplitude: float, components: list) -> np.ndarray:
-    """Return the modes of fields at the grid points, times the amplitude."""
+    """Return `amplitude` times the modes of a field whose `components` are values at the grid points."""
     field = np.stack([np.broadcast_to(np.asarray(c, grid.real), grid.physical_shape) for c in components])
     return grid.forward(amplitude * field)

@@ -21,7 +21,7 @@ class Fluid:
     grid : grid of the flow.
     viscosity : kinematic viscosity nu.
     sound_speed : c; infinite for an incompressible fluid.
-    forcing : adds a force to the velocity's tendency. The release of tracers ends it unless [tracers] forced is true.
+    forcing : adds a force to the velocity's tendency. It ends at the release of tracers unless [tracers] forced = true.
     closure : force of the scales that a coarse grid or a filter leaves out.
 
     The state is held as modes. If `compressible`, it is (u, v, w, s) with s = ln(rho / rho_0), (4, kz, ky, kx);

@@ -13,8 +13,8 @@ from eddies.flow.navier_stokes import Fluid, advective_speed
 from eddies.parallel.reduction import global_max, global_sum
 from eddies.time_stepping import RungeKutta4
 
-# Where the axes leave the stability region |1 + z + z^2/2 + z^3/6 + z^4/24| <= 1 of the four-stage fourth-order
-# Runge-Kutta method.
+# Where the imaginary and the negative real axis leave the stability region |1 + z + z^2/2 + z^3/6 + z^4/24| <= 1 of
+# the four-stage fourth-order Runge-Kutta method.
 IMAGINARY_REACH, REAL_REACH = math.sqrt(8), 2.785293563405282
 
 # Above this advective number undamped sound grows by more than 0.1 % a step with ETDRK4: see `limits_of_step`.

@@ -24,7 +24,7 @@ def component_energies(grid: SpectralGrid, velocity: np.ndarray) -> dict[str, fl
 def turbulence_scales(spectrum: np.ndarray, dissipation_rate: float, viscosity: float, cutoff: int) -> dict[str, float]:
     """Return scales of isotropic turbulence from E(k), the dissipation rate eps and the viscosity nu.
 
-    u' = sqrt(2E/3), L = pi/(2u'^2) sum E/k, T = L/u', lambda = sqrt(15 nu u'^2/eps), Re_lambda = u' lambda/nu,
+    u'^2 = 2/3 sum E(k), L = pi/(2u'^2) sum E(k)/k, T = L/u', lambda = sqrt(15 nu u'^2/eps), Re_lambda = u' lambda/nu,
     eta = (nu^3/eps)^(1/4), t_eta = sqrt(nu/eps) (Pope 2000, chapter 6). If nu or eps is 0, viscous scales are 0 or inf.
     """
     energy = spectrum.sum()
@@ -86,8 +86,8 @@ def compressible_budget(grid: SpectralGrid, state: np.ndarray, viscosity: float,
 
     `total_energy` is <rho |u|^2/2 + c^2 (rho ln rho - rho + 1)>. Without forcing it decays exactly at
     `dissipation_rate`, nu <rho (2 S:S - 2/3 (div u)^2)>. `compressible_fraction` is the share of <u.u> in the
-    longitudinal velocity. `density_rms` is the rms fluctuation of rho, with rho_0 = 1. `skewness` and `flatness` are as
-    in `gradient_moments`.
+    velocity along the wavevector. `density_rms` is the rms fluctuation of rho, with rho_0 = 1. `skewness` and
+    `flatness` are as in `gradient_moments`.
     """
     def with_gradients(modes: np.ndarray) -> list[np.ndarray]:
         return [modes[:4], (grid.d_dx, modes[:3]), (grid.d_dy, modes[:3]), modes[4:]]

@@ -1,4 +1,4 @@
-"""Subgrid closures: models of the force that the scales removed by a coarse grid or a filter exert on the rest."""
+"""Subgrid closures: models of how the scales that a coarse grid or a filter removes act on the resolved scales."""
 
 from collections.abc import Callable
 
@@ -10,7 +10,7 @@ from eddies.spectral.spectral_grid import SpectralGrid
 
 # Number of times that each entry xx, yy, zz, xy, xz, yz occurs in a symmetric matrix.
 TIMES = np.array([1, 1, 1, 2, 2, 2])
-# Constants of nu_t (k_c / E(k_c))^(1/2): its value far below k_c, its growth towards k_c, and the rate of the growth
+# Constants of nu_t (k_c / E(k_c))^(1/2): the value far below k_c, and size and rate of the exponential growth near k_c
 # (Chollet and Lesieur 1981, in the form of Lesieur and Metais 1996, Kolmogorov constant 1.4).
 PLATEAU, CUSP, STEEPNESS = 0.267, 34.5, 3.03
 
@@ -19,7 +19,7 @@ class Closure:
     """Base of all closures. Velocities and forces are modes (3, kz, ky, kx)."""
 
     def begin_step(self, velocity: np.ndarray) -> None:
-        """From the velocity at the start of a step, compute what stays constant during the step; collective."""
+        """Compute, from the velocity at the start of a step, what stays constant during the step; collective."""
 
     def add(self, velocity: np.ndarray, tendency: np.ndarray) -> None:
         """Add the force to `tendency`, the rate of change of the velocity, in place."""
@@ -80,9 +80,10 @@ class DynamicStress(StressModel):
 
         l^2 = max(<(L - H):M> / <M:M>, 0),   L = (uu)^ - u^ u^,   M = 2 ((|S|S)^ - r |S^|S^).
 
-    ^ is a test filter, applied after the first filter, that of the simulation. Both together form the combined filter.
-    r is the ratio of the squared widths of the combined and the first filter. H is the gradient part of the stress of
-    the combined filter minus the test-filtered gradient part of the first filter.
+    ^ denotes the test filter. It acts on fields that have passed the first filter, the one of the simulation. Both
+    together form the combined filter. r is the squared width of the combined filter divided by that of the first.
+    H is the gradient part of the combined filter's stress, minus the test-filtered gradient part of the first filter's
+    stress.
 
     With a filter width d, the first filter is Gaussian of width d, ^ is Gaussian of width 2 d, and r = 5. If the filter
     width is 0, the first filter is the grid, and ^ cuts off above half the highest wavenumber of the grid. All tensors

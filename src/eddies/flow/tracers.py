@@ -68,7 +68,7 @@ class TracerParticles:
     """Advection dx/dt = v(x, t) by the filtered velocity with Heun's method, second order in time.
 
     `columns` holds `id`, `position` and `velocity` of this rank's particles. `velocity` is the filtered velocity at the
-    particle; if it is absent, it is computed from `state`.
+    particle; an absent `velocity` is computed from `state`.
     """
 
     def __init__(self, field: FilteredField, columns: dict[str, np.ndarray], state: np.ndarray) -> None:

@@ -40,13 +40,13 @@ KEPT = 3
 NAME = re.compile(r"step-(\d{8,})(\.h5)?")
 PLAIN = "plain"  # the dataset of everything that is not an array, as JSON
 # Checkpoints of another format are not used. Raise this number also when FORMAT of io/provenance.py is raised, because
-# the files with the frames of a checkpoint are products.
+# the files with the frames of a checkpoint have that format.
 FORMAT = 11
 
 
 @dataclass(frozen=True)
 class Block:
-    """This rank's part of a global array: rows start, start + 1, ... of `total` along `axis`, or no row."""
+    """This rank's part of a global array with `total` rows along `axis`: the rows start, start + 1, ..., or no row."""
 
     values: np.ndarray
     start: int
@@ -62,7 +62,8 @@ class Checkpoint(Mapping):
 
     @cached_property
     def content(self) -> dict[str, Any]:
-        """A dict of `step`, `format`, `fingerprint`, `computed_by`, `values` (no arrays) and `files` (checksums)."""
+        """A dict of `step`, `format`, `fingerprint`, `computed_by`, `values` and `files`. `values` maps names to
+        the values that are not arrays; `files` maps file names to checksums."""
         return json.loads(self.read(PLAIN).tobytes())
 
     @property
@@ -94,11 +95,11 @@ class CheckpointDirectory:
         self.comm, self.path, self.fingerprint = comm, path, fingerprint
 
     def write(self, step: int, state: Mapping[str, Any], files: Sequence[str] = ()) -> None:
-        """Add a checkpoint, and remove all but the newest KEPT. If it cannot be written, earlier ones stay intact.
+        """Add a checkpoint, and keep only the KEPT newest. If it cannot be written, earlier checkpoints stay intact.
 
         `state` holds, by name, `Block`s of arrays, whole arrays, and values for JSON. Whole arrays and values are taken
-        from rank 0; on other ranks, measured times may differ. `files` are names of closed files of the directory that
-        belong to the checkpoint.
+        from rank 0; those of other ranks, such as measured times, may differ. `files` are names of closed files of the
+        directory that belong to the checkpoint.
         """
         path = self.path / f"step-{step:08d}.h5"
         arrays = {name: part for name, part in state.items() if isinstance(part, np.ndarray | Block)}
@@ -239,8 +240,8 @@ def _computed_by() -> str:
 def _write_array(file: h5py.File, name: str, block: Block) -> None:
     """Write a global array from the blocks of all ranks.
 
-    If the blocks are distributed along a later axis than the first, one index of the first axis is written at a time:
-    MPI counts bytes in 32 bits, and a single writer holds each written part in memory.
+    If `axis` is not the first axis, one index of the first axis is written at a time. This keeps each written part
+    small: MPI counts its bytes in 32 bits, and a single writer holds it in memory.
     """
     values, axis = block.values, block.axis
     shape = (*values.shape[:axis], block.total, *values.shape[axis + 1:])

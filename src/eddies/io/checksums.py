@@ -39,8 +39,8 @@ NAMED = 3  # largest number of datasets that an error names
 def open_to_read(path: str | Path) -> h5py.File:
     """Open any HDF5 file for reading. If it has checksums, all bytes that are read are compared with them.
 
-    HDF5's own file lock is not used: some network file systems do not support it. A run directory has a lock of its
-    own, and a product gets its name only when it is complete.
+    HDF5's own file lock is not used, because some network file systems do not support it. It is not needed: a run
+    directory has a lock, and a product gets its name only when it is complete.
 
     Raises:
         OSError: the file cannot be opened, or its checksums are missing.
@@ -58,7 +58,7 @@ def open_to_read(path: str | Path) -> h5py.File:
 
 
 class CheckedFile:
-    """A file object for h5py.File that checks each read. With `naming`, an error names the wrong dataset and frame."""
+    """A file object for h5py.File that checks each read. With `naming`, errors name the damaged dataset and frame."""
 
     _descriptor: int | None = None
 
@@ -134,9 +134,9 @@ def table_checksum(path: Path) -> int | None:
 def find_damage(comm: MPI.Comm, path: Path, known: int | None = None) -> str | None:
     """Compare a file with its checksums; collective.
 
-    Returns a line with file, dataset and frame of the first damage, or None. `known` is the result of `table_checksum`
-    for the expected file. Raises ProductError, on all ranks, if the system refuses to read the file, which may
-    be undamaged.
+    Returns a text with file, dataset and frame of the first damage; None if the file is undamaged. `known` is
+    the result of `table_checksum` for the expected file. Raises ProductError, on all ranks, if the system refuses to
+    read the file, which may be undamaged.
     """
     from eddies.parallel.broadcast import on_all_ranks, on_first_rank
     from eddies.parallel.reduction import global_min
@@ -182,14 +182,14 @@ def _count_blocks(size: int) -> int:
 
 
 def _covered_bytes(descriptor: int) -> int | None:
-    """The number of bytes that the checksums cover; None if the file has none."""
+    """The number of bytes that the checksums cover; None if the file has no checksums."""
     end = os.fstat(descriptor).st_size - FOOTER.size
     size, mark = FOOTER.unpack(os.pread(descriptor, FOOTER.size, end)) if end > 0 else (0, b"")
     return size if mark == MARK and size + 4 * _count_blocks(size) == end else None
 
 
 def _own_pieces(comm: MPI.Comm, size: int) -> Iterator[tuple[int, memoryview]]:
-    """Divide this rank's share of the blocks into pieces. Yields the first block of each piece, and a buffer for it."""
+    """Divide this rank's blocks into pieces. Yields the number of each piece's first block, and a buffer for it."""
     from eddies.parallel.slab import block_starts
     start, stop = map(int, block_starts(_count_blocks(size), comm.size)[comm.rank:comm.rank + 2])
     buffer = memoryview(bytearray(PIECE * BLOCK_BYTES))
@@ -198,7 +198,7 @@ def _own_pieces(comm: MPI.Comm, size: int) -> Iterator[tuple[int, memoryview]]:
 
 
 def _first_wrong(descriptor: int, first: int, part: memoryview, size: int, skipped: int = 0) -> int | None:
-    """Fill `part` as `_read_sums` does. Returns the number of the first wrong block, or None."""
+    """Fill `part` as `_read_sums` does. Returns the number of the first block with a wrong checksum, or None."""
     sums = _read_sums(descriptor, first, part, size, skipped)
     wrong = np.flatnonzero(sums != _read_table(descriptor, first, first + len(sums), size))
     return first + int(wrong[0]) if wrong.size else None
@@ -211,7 +211,7 @@ def _read_table(descriptor: int, first: int, last: int, size: int) -> np.ndarray
 
 def _read_sums(descriptor: int, first: int, part: memoryview, size: int, skipped: int = 0) -> np.ndarray:
     """Fill `part` with bytes of a file, starting `skipped` bytes after the beginning of block `first`. The checksums
-    cover the first `size` bytes of the file. Returns the checksums of all blocks that the part touches."""
+    cover the first `size` bytes of the file. Returns the computed checksums of all blocks that `part` touches."""
     start, end = first * BLOCK_BYTES, first * BLOCK_BYTES + skipped + len(part)
     head, tail = bytearray(skipped), bytearray(min(_count_blocks(end) * BLOCK_BYTES, size) - end)
     os.preadv(descriptor, [head, part, tail], start)

@@ -1,4 +1,4 @@
-"""Errors about files, for users: file, reason and remedy in one line."""
+"""Errors about files, for users. Each message names the file, the reason and the remedy in one line."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from eddies.errors import UserError
 from eddies.pipeline import MAKER_OF
 
-# A full disk, a used-up quota, a file larger than is allowed.
+# Error numbers of a full disk, of a used-up quota, and of a file larger than is allowed.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -35,7 +35,7 @@ def write_error(path: Path | str, error: OSError, wanted: int = 0) -> WriteError
 
 @contextmanager
 def file_errors(path: Path | str, wanted: int = 0) -> Iterator[None]:
-    """Convert an OSError inside the block to a WriteError."""
+    """Convert an OSError inside the block to a WriteError. `wanted` is as in `write_error`."""
     try:
         yield
     except OSError as error:
@@ -43,7 +43,7 @@ def file_errors(path: Path | str, wanted: int = 0) -> Iterator[None]:
 
 
 def space_in_words(path: Path | str, wanted: int) -> str:
-    """A text with the bytes wanted for a file, unless they are unknown (0), and the free bytes of its file system."""
+    """Text with the free bytes of a file system and, unless `wanted` is 0, the bytes wanted for the file at `path`."""
     disk = os.statvfs(next(place for place in Path(path).absolute().parents if place.is_dir()))
     free = disk.f_bavail * disk.f_frsize
     if disk.f_files and not disk.f_favail:
@@ -60,6 +60,6 @@ def read_error(path: Path | str, error: OSError) -> ProductError | None:
 
 
 def remedy_for(kind: str, file: str = "it") -> str:
-    """The remedy, in words, for a product of a `kind` that cannot be used. The stage that makes it would keep the file,
-    so the user has to remove it. `file` is the text that stands for the file."""
+    """The remedy, in words, for a product of a `kind` that cannot be used. The stage that makes such a product
+    keeps an existing file, so the user has to remove it. `file` is the text that names the file."""
     return f"remove {file} and run `eddies {MAKER_OF[kind].name}` again" if kind in MAKER_OF else "make it again"

@@ -16,7 +16,7 @@ class FieldWriter:
     ----------
     file : an open product.
     name : the group under /fields.
-    cells : grid points along each side; point i is at i L / cells.
+    cells : grid points along each side; point i is at i * edge / cells.
     variables : number of components of each variable, such as {"velocity": 3, "density": 1}.
     """
 
@@ -28,7 +28,8 @@ class FieldWriter:
                            for variable, components in variables.items()}
 
     def append(self, time: float, start_plane: int, variables: Mapping[str, np.ndarray]) -> None:
-        """Add a frame. `variables` holds this rank's planes start_plane, ... as (components, planes, y, x), or none."""
+        """Add a frame. `variables` holds this rank's planes start_plane, start_plane + 1, ... of each variable,
+        (components, planes, y, x), or no plane."""
         append_frame(self._time, np.array(time), ())
         for variable, dataset in self._variables.items():
             append_frame(dataset, variables[variable], (0, start_plane, 0, 0))

@@ -34,7 +34,7 @@ from eddies.parallel.reduction import global_max, global_min, global_sum
 
 CUTOUT_EDGE = 2 * math.pi
 CUTOUT_NAME = re.compile(r"[Vv]elocity_(\d+)")
-NOT_DELIVERED = -999.9, 9.969209968386869e36  # of JHTDB; default of netCDF for values that were never written
+NOT_DELIVERED = -999.9, 9.969209968386869e36  # marks of missing values: of JHTDB, and by default of netCDF
 LARGEST_VELOCITY = 1e12  # its square, summed over a grid, fits into single precision
 FILL_ATTRIBUTES = "_FillValue", "missing_value"
 # The first bytes of files in other formats, with a remedy.
@@ -92,7 +92,7 @@ class VelocityCubes:
         fills = dict.fromkeys([*NOT_DELIVERED, *(float(value[0]) for value in own
                                                  if value.size and value.dtype.kind == "f" and value[0])])
         for fill in fills:  # in the same order on all ranks
-            with np.errstate(over="ignore"):  # a mark may exceed half precision
+            with np.errstate(over="ignore"):  # the fill value may be too large for half precision
                 mark = np.asarray(fill).astype(velocity.dtype)
             if count := int(global_sum(comm, np.count_nonzero(velocity == mark))):
                 raise ProductError(f"{_place(dataset)}: {count} values are {fill:.6g}, the mark of points that were "

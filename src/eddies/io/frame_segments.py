@@ -35,7 +35,7 @@ class TrajectoryLayout:
 
 @dataclass(frozen=True)
 class FrameLayout:
-    """The content of frames, in a segment and in the product. Series may have different times."""
+    """The series of frames in a segment or product: trajectories and fields. Series may have different times."""
 
     length: float  # edge of the periodic cube
     trajectories: Mapping[str, TrajectoryLayout]  # by name
@@ -44,8 +44,11 @@ class FrameLayout:
 
     def writers(self, file: File, names: Mapping[str, str], images: bool = False
                 ) -> tuple[dict[str, TrajectoryWriter], dict[str, FieldWriter]]:
-        """Writers of trajectories and writers of fields, each by name; collective. `names` maps the series that get a
-        writer to their names in the file. `images` adds the column `image` to trajectories with positions."""
+        """Return a dict of writers of trajectories and one of writers of fields, by name of the series; collective.
+
+        `names` maps each series that gets a writer to its name in the file. `images` adds the column `image` to
+        trajectories with positions.
+        """
         return ({name: TrajectoryWriter(file, names[name], series.total, self.length, series.columns, self.dtype,
                                         images and "position" in series.columns)
                  for name, series in self.trajectories.items() if name in names},
@@ -95,8 +98,8 @@ class FrameSegments:
         return frames[:count]
 
     def assemble(self, file: File, names: Mapping[str, str] | None = None) -> None:
-        """Copy the frames of all segments into a product, and add the images. `names` maps each series to copy to its
-        name in the product. If it is None, all series are copied under their own names."""
+        """Copy the frames of all segments into a product, and add the column `image`. `names` maps each series that is
+        copied to its name in the product. If `names` is None, all series are copied under their own names."""
         self.close()
         trajectories, fields = self.layout.writers(file, self.layout.names if names is None else names, images=True)
         slabs = {name: SlabDecomposition(self.comm, self.layout.length, series.cells)

@@ -45,7 +45,8 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
 
     `provenance` (the scene's text, its fingerprint, ...; JSON-able) is stored with the versions of all libraries, the
     number of ranks, the date and an id. Its `made_from` lists kinds of products; the ids of such products in the same
-    directory are stored. An `id` in `provenance` is kept, for a file that replaces one from which others were made.
+    directory are stored. If `provenance` holds an `id`, the product gets this id, not a new one. A file
+    that replaces a product can thus keep its id, which other products may name as their origin.
 
     Raises:
         WriteError: on all ranks; the file cannot be written or renamed.
@@ -106,7 +107,7 @@ def read_table(file: h5py.Group, name: str) -> dict[str, np.ndarray]:
 
 
 def find_group(file: h5py.Group, name: str) -> h5py.Group:
-    """The group `name`. If there is no such group, ProductError, which lists what there is."""
+    """The group `name`. If there is no such group, a ProductError lists what `file` holds."""
     group = file.get(name)
     if not isinstance(group, h5py.Group):
         raise ProductError(f"{file.file.filename}: holds no {name}; its group {file.name} holds "
@@ -176,7 +177,7 @@ def read_frame(dataset: h5py.Dataset, frame: int, selection: tuple[slice, ...], 
     """A part of a frame of floating-point numbers.
 
     ProductError, on this rank, if a number is not finite or, with a finite `limit`, is outside the range 0 to `limit`.
-    A rollout may end with numbers that are not finite, and there they are no error.
+    In a rollout, numbers that are not finite are no error, because a rollout may end with them.
     """
     values, kind = dataset[frame, *selection], dataset.file.attrs["kind"]
     place = f"frame {frame % len(dataset)}: holds values that are"

@@ -65,7 +65,8 @@ def write_dataset(directory: Path, trajectory: Trajectory, case: str, provenance
 
 
 def _copy_frames(trajectory: Trajectory, start: int, positions: h5py.Dataset) -> np.ndarray:
-    """Copy frames from `start` on. Returns (velocity or acceleration, mean or mean square, component), (2, 2, 3)."""
+    """Fill `positions` with the frames from number `start` on. Returns an array (2, 2, 3), whose axes are velocity or
+    acceleration, mean or mean square, and component."""
     length, sums, before, velocity_before = trajectory.length, np.zeros((2, 2, 3)), None, None
     for row in range(len(positions)):
         stored = trajectory.read(start + row, "position").astype(np.float32)

@@ -4,10 +4,10 @@ Everything is written to NAME.partial, which is renamed at the end. A full disk,
 leaves the former file as it was. There are two ways to write:
 
 - `write_files`: small files (JSON, pages, pictures), by one rank.
-- `new_file`: an HDF5 file, by all ranks together; `create_export` is a short form for files of other programs.
+- `new_file`: an HDF5 file, by all ranks together; `create_export` uses it for files that other programs read.
 
 HDF5 does not survive a write that fails: it crashes when it closes the file, or ranks wait for each other for ever.
-Two measures prevent this, and a third is for an h5py that is built without MPI, as the wheels of h5py are:
+Measures 1 and 2 prevent this. Measure 3 is for an h5py that is built without MPI, such as its wheels:
 
 1. Each write is announced by `writing`, which reserves the space on the disk first. If there is too little, all ranks
    raise WriteError before HDF5 writes; the file can then be closed and removed. A margin stays reserved for what HDF5
@@ -183,7 +183,7 @@ def own_part(group: h5py.Group | h5py.Dataset, shape: tuple[int, ...], block: np
 
 
 def frame_bytes(dataset: h5py.Dataset) -> int:
-    """The most bytes by which a file grows if a chunked dataset gets one more frame."""
+    """An upper limit of the bytes by which a file grows when a chunked dataset gets one more frame."""
     if dataset.shape[0] % dataset.chunks[0]:
         return 0
     chunks = math.prod(-(-extent // chunk) for extent, chunk in zip(dataset.shape[1:], dataset.chunks[1:]))

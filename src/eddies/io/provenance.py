@@ -21,8 +21,8 @@ from eddies.kernels.library import in_use
 from eddies.pipeline import MAKER_OF
 
 # The format of products; other formats are not read. Files of format 1 (eddies 0.1) do not name their format. Since
-# format 2, scales are those at the release of the tracers, and a model is a list of terms. Since format 3, the filter
-# width has the name `filter_width`.
+# format 2, the scales of the flow are measured at the release of the tracers, and a model is a list of terms. Since
+# format 3, the filter width has the name `filter_width`.
 FORMAT = 3
 LIBRARIES = ("numpy", "mpi4py", "h5py", "pyfftw", "torch")
 
@@ -63,7 +63,8 @@ def commit() -> str | None:
 
 
 def identity(directory: Path, kinds: Iterable[str]) -> dict[str, Any]:
-    """A new `id`, and `made_from`: the ids, by kind, of such products in a directory. Old products have the id None."""
+    """A dict with a new `id`, and with `made_from`, which maps each of the `kinds` to the id of that product in a
+    directory. A missing or unreadable product is left out; a product without an id gives None."""
     beside = {kind: product_provenance(directory / MAKER_OF[kind].file) for kind in kinds}
     return {"id": uuid.uuid4().hex, "made_from": {kind: origin.get("id") for kind, origin in beside.items() if origin}}
 

@@ -32,7 +32,7 @@ log = logging.getLogger("eddies")
 
 LOCK = "LOCK"
 SIGN_SECONDS = 30.0
-STALE_SECONDS = 300.0  # ten missed signs of life, as on a file system that hangs for a while
+STALE_SECONDS = 300.0  # ten missed signs of life, because a file system may hang for a while
 SETTLE_SECONDS = 0.5  # within this time, other jobs that have found the same stale lock replace it, too
 UNREADABLE = "unknown"
 
@@ -116,7 +116,7 @@ class FoundLock:
 
 class RunLock:
     """The lock that this job holds, on rank 0. A thread gives signs of life. `made` says whether the job has made the
-    directory; if so, `release` removes an empty directory."""
+    directory; if so, `release` removes the directory if it is empty."""
 
     def __init__(self, directory: Path, holder: Holder, made: bool) -> None:
         self.directory, self.path, self.holder, self.made = directory, directory / LOCK, holder, made
@@ -146,7 +146,7 @@ class RunLock:
         if _is_held_by(self.path, self.holder):
             self.path.unlink(missing_ok=True)
         if self.made:
-            with contextlib.suppress(OSError):  # it holds files
+            with contextlib.suppress(OSError):  # the directory holds files
                 self.directory.rmdir()
 
     def _give_signs(self) -> None:

@@ -33,7 +33,7 @@ from eddies.io.trajectories import ROUNDING, write_h5md_header
 AXES = ("x", "y", "z")
 FILL = -1  # the id of a row without a particle
 MOST_ID = 2**53  # larger ids are not exact in double precision
-MOST_OFF = 2.0  # a larger factor between displacement and velocity * interval is an error of the units
+MOST_OFF = 2.0  # if displacement and velocity * interval differ by a larger factor, their units are wrong
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,8 @@ class Tracks:
     def displacements(self, edge: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Displacements between successive rows of each track; m is the number of such pairs of rows.
 
-        Returns first row of each pair (m,), displacement (m, 3) and time interval (m,). `edge` is the edge of a
-        periodic cube, in which a displacement leads to the nearest image, or None without a cube.
+        Returns first row of each pair (m,), displacement (m, 3) and time interval (m,). `edge` is the edge of the
+        periodic cube; each displacement then leads to the nearest image. None means that there is no such cube.
         """
         order = np.lexsort((self.time, self.track))
         same = self.track[order[1:]] == self.track[order[:-1]]
@@ -241,7 +241,7 @@ def _read_csv(path: Path, group: str | None, interval: float | None) -> Tracks:
 
 LAYOUTS: Mapping[str, Callable[[Path, str | None, float | None], Tracks]] = {
     "h5md": _read_h5md, "npz": _read_npz, "lagrangebench": _read_lagrangebench, "csv": _read_csv}
-# Errors of numpy, h5py and json for a file with other content.
+# Errors that numpy, h5py and json raise for a file whose content does not fit the layout.
 UNREADABLE = (KeyError, ValueError, TypeError, IndexError, AttributeError, EOFError, BadZipFile, zlib.error)
 
 
@@ -313,9 +313,9 @@ def checked(tracks: Tracks, path: Path) -> Tracks:
 
 
 def check_inside(tracks: Tracks, lower: np.ndarray, upper: np.ndarray, key: str, path: str | Path) -> None:
-    """Raise ProductError if positions are outside the region from `lower` to `upper`: the unit of length is wrong.
+    """Raise ProductError if positions are outside the region from `lower` to `upper`.
 
-    `key` is the key of the scene that gives the region, "box" or "volume".
+    The region or the unit of length is then wrong. `key` is the scene key that gives the region, "box" or "volume".
     """
     margin = ROUNDING * (upper - lower)
     outside = np.flatnonzero(((tracks.position < lower - margin) | (tracks.position > upper + margin)).any(1))
@@ -328,8 +328,8 @@ def check_inside(tracks: Tracks, lower: np.ndarray, upper: np.ndarray, key: str,
 
 
 def check_velocities(tracks: Tracks, edge: float | None, path: str | Path) -> None:
-    """Raise ProductError if velocities contradict displacements: the unit of length or time is wrong. `edge` is the
-    edge of the periodic cube, or None."""
+    """Raise ProductError if the median speeds from displacements and from velocities differ by the factor MOST_OFF or
+    more. A unit or the box is then wrong. `edge` is the edge of the periodic cube, or None."""
     if tracks.velocity is None:
         return
     first, moved, interval = tracks.displacements(edge)

@@ -1,8 +1,8 @@
 """Particle trajectories in the H5MD 1.1 layout (de Buyl, Colberg & Höfling, Comput. Phys. Commun. 185, 1546).
 
 Row k of every frame belongs to the particle with id k, so frames can be compared without sorting. The box has edges for
-every frame. The attribute `unit` names molecular units for L, T and L/T, because readers such as MDAnalysis accept no
-others.
+every frame. The attribute `unit` names molecular units (Angstrom, ps) in place of L, T and L/T, because readers such as
+MDAnalysis accept no others.
 """
 
 from collections.abc import Mapping
@@ -76,7 +76,7 @@ class TrajectoryWriter:
         return values
 
     def _count_images(self, position: np.ndarray) -> np.ndarray:
-        """Return the images (n, 3) of this rank's particles in the next frame, whose wrapped positions are (n, 3)."""
+        """Return the column `image` (n, 3) of this rank's particles in the next frame, from their wrapped positions."""
         left = np.zeros_like(position) if self._before is None else np.rint((self._before - position) / self._length)
         # A rollout may end with positions that are not finite.
         self._image = self._image + np.nan_to_num(left, posinf=0, neginf=0).astype(np.int16)

@@ -85,7 +85,7 @@ def _create(path: Path, kind: str, frames: int, layout: Layout,
 
 
 def _write_steps(root: h5py.Group, times: np.ndarray, offsets: Mapping[str, np.ndarray]) -> None:
-    """Write the times of the steps, and the offset of each step in each dataset. A single time is field data."""
+    """Write the times of the steps, and each step's offset in each dataset. A single time is written as field data."""
     if len(times) == 1:
         root["FieldData/time"] = times
         return
@@ -96,7 +96,8 @@ def _write_steps(root: h5py.Group, times: np.ndarray, offsets: Mapping[str, np.n
 
 
 def _copy_field(series: FieldSeries, frame: int, variable: str, dataset: h5py.Dataset) -> None:
-    """Copy (components, z, y, x) to (z, y, x, components), and repeat the first plane of each axis at its end."""
+    """Copy a field (components, z, y, x) to a dataset (z, y, x, components); the last plane of each axis repeats the
+    first."""
     cells, frames = series.cells, len(series.times)
     step = () if frames == 1 else (frame,)
     blocks = math.ceil(dataset.nbytes / frames / BLOCK_BYTES)

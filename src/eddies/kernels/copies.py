@@ -1,8 +1,8 @@
 """Copies before and after the one-dimensional passes of a slab transform.
 
-Along an axis of `cells` points a transform keeps the modes 0 ... K, -K ... -1, at both ends of its arrays. The gap
-between them stays zero. Arrays that are used many times are passed to `described` once, because numpy returns addresses
-slowly. Arrays must be contiguous and of the given precision; ValueError otherwise.
+Along an axis of `cells` points a transform keeps the modes 0 ... K at the beginning of its array and -K ... -1 at the
+end. The gap between them stays zero. Arrays that are used many times are passed to `described` once, because numpy
+returns addresses slowly. Arrays must be contiguous and of the given precision; ValueError otherwise.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class _Blocks(ctypes.Structure):
 class _Array:
     """An array with its address, shape and strides.
 
-    The array is contiguous. With `gaps`, only its parts along the first axis need to be contiguous. `apart` is the
-    number of elements from the beginning of one part to the next.
+    The array must be contiguous or, with `gaps`, each of its parts along the first axis. `apart` is the number of
+    elements from the beginning of one part to the beginning of the next.
     """
 
     def __init__(self, array: np.ndarray, gaps: bool = False) -> None:
@@ -85,12 +85,12 @@ class ColumnCopies(_Copies):
         self._receive = self._function("receive_column", ADDRESS, *4 * [INT], ADDRESS)
 
     def fill(self, modes: _Array, component: int, rows: slice, factors: _Array | None, column: _Array) -> None:
-        """Copy the modes of some rows, multiplied by the factors (kz) if given, to a column."""
+        """Copy the modes of a component at some `rows` to a column. Factors (kz), if given, multiply the modes."""
         sizes, start = self._sizes(modes, component, rows, column)
         self._fill(*sizes, start, None if factors is None else factors.address, column.address)
 
     def store(self, column: _Array, scale: float, modes: _Array, component: int, rows: slice) -> None:
-        """Copy a column, multiplied by `scale`, to the modes of some rows."""
+        """Copy a column, multiplied by `scale`, to the modes of a component at some `rows`."""
         sizes, start = self._sizes(modes, component, rows, column)
         self._store(*sizes, column.address, scale, start)
 
@@ -120,7 +120,7 @@ class PlaneCopies(_Copies):
     planes f and g are transformed as one complex plane f + i g. Of the planes that are transformed together, f is in
     the first half, and g has the same place in the second half. The packed modes (c, pairs, ky, kx) of f + i g hold
     kx = 0 ... K, -K ... -1. The number of planes is even, or one: a single plane is its own partner. Because of
-    round-off, modes with kx = 0 and their mirror images may not be exactly conjugate, so their mean is taken.
+    round-off, a mode with kx = 0 may differ from the conjugate of its mirror image. The mean of both is then taken.
     """
 
     exchanged_axis = 2

@@ -27,7 +27,7 @@ class _Sums(ctypes.Structure):
 def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.ndarray, support: float, noise: float,
                     slowest: float, amplitudes: np.ndarray,
                     sited: bool = True) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Weights of the receivers' own values (10, n), and of their neighbours' values, ten arrays (m,).
+    """Weights of n receivers' own values, (10, n), and of their neighbours' values, ten arrays (m,) for m pairs.
 
     `eddies.particles.kriging.kriging_weights` defines them. The ten arrays are separate so that each is small enough
     for the allocator to keep its memory when it is freed.
@@ -39,7 +39,7 @@ def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.
     support : distance beyond which a receiver has no neighbours.
     noise : variance of the part of a value that does not belong to the field.
     slowest, amplitudes : parameters of the covariance sum_k amplitudes[k] exp(-slowest 2^k r^2), at most eight terms.
-    sited : whether receivers are particles, so that their own values count.
+    sited : whether receivers are particles, which have values of their own.
     """
     dtype, pairs = displacement.dtype, displacement.shape[-1]
     offsets, amplitudes = np.ascontiguousarray(offsets, np.int64), np.ascontiguousarray(amplitudes, np.float64)

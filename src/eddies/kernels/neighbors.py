@@ -34,7 +34,7 @@ def neighbors_within(library: ctypes.CDLL, box: Box, radius: float, receivers: n
                      exclude_self: bool) -> tuple[np.ndarray, np.ndarray]:
     """Find the senders (s, 3) within a radius of each receiver (n, 3). Returns `offsets` (n + 1,) and `rows` (m,).
 
-    The neighbours of receiver i are the senders in the rows `rows[offsets[i]:offsets[i + 1]]`. With `exclude_self`,
+    The neighbours of receiver i are the senders with indices `rows[offsets[i]:offsets[i + 1]]`. With `exclude_self`,
     receiver i and sender i are one particle, which is not its own neighbour. All positions must be finite.
     """
     receivers, senders = (np.ascontiguousarray(points, np.float64) for points in (receivers, senders))
@@ -50,11 +50,11 @@ def neighbors_within(library: ctypes.CDLL, box: Box, radius: float, receivers: n
 
 def pairs_within(library: ctypes.CDLL, box: Box, radius: float, receivers: np.ndarray, senders: np.ndarray,
                  offsets: np.ndarray, listed: np.ndarray, rows: np.ndarray, kind: np.dtype) -> tuple[np.ndarray, ...]:
-    """Find the pairs of a neighbour list whose present distance is within a radius, for the receivers `rows` (k,).
+    """Find those pairs of a neighbour list that lie within `radius` at the given positions, for some receivers.
 
-    `offsets` and `listed` are the list, as `neighbors_within` returns it. Returns five columns of the m pairs: row of
-    the receiver (m,), its place in `rows` (m,), row of the sender (m,), displacement x_receiver - x_sender between
-    nearest images (3, m), and distance (m,).
+    `rows` (k,) are the indices of these receivers. `offsets` and `listed` are the result of `neighbors_within`. Returns
+    five arrays for the m pairs: index of the receiver (m,), its place in `rows` (m,), index of the sender (m,),
+    displacement x_receiver - x_sender between nearest images (3, m), and distance (m,).
     """
     receivers, senders = (np.ascontiguousarray(points, np.float64) for points in (receivers, senders))
     rows, first = np.ascontiguousarray(rows, np.int64), np.empty(len(rows) + 1, np.int64)

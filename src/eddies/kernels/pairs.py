@@ -20,7 +20,7 @@ class Summand:
     """A quantity to sum over pairs: its name `kind` and its constants `numbers`, as in summands.hpp.
 
     If each pair is evaluated once (`PairSpace.mutual`), its second particle gets the first one's value times `parity`
-    (components,). `scalar` is the number of the first scalar column that the summand reads.
+    (components,). The summand reads the scalar columns of `CompiledPairs` from index `scalar` on.
     """
 
     kind: str
@@ -86,7 +86,7 @@ class CompiledPairs:
             space.length_unit, space.velocity_unit, space.mutual)
 
     def sums(self, summands: Sequence[Summand], parameters: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """The sums of each summand with its parameters, (components, n), valid at the wanted particles.
+        """A list of the sums (components, n) of each summand with its parameters, valid only at the wanted particles.
 
         Raises ValueError if a position is not finite or the library has no such summand.
         """
@@ -96,10 +96,11 @@ class CompiledPairs:
 
     def gradients(self, summands: Sequence[Summand], parameters: Sequence[np.ndarray], by_sums: Sequence[np.ndarray],
                   columns: bool) -> tuple[list[np.ndarray], tuple[np.ndarray, ...]]:
-        """Gradients of a loss with respect to parameters and, if `columns`, to position, velocity and scalars.
+        """Return the gradients of a loss with respect to each of `parameters`, and to (position, velocity, scalars).
 
-        `by_sums` are the gradients of the loss with respect to the sums. They must be zero at particles that are not
-        wanted. Raises ValueError as `sums` does, and if a summand has no gradient.
+        The second result is an empty tuple unless `columns` is true. `by_sums` are the gradients of the loss with
+        respect to the sums, zero at particles that are not wanted. Raises ValueError as `sums` does, and if a summand
+        has no gradient.
         """
         by_parameters = [np.zeros(len(values)) for values in parameters]
         by_columns = tuple(np.empty_like(column) for column in self._columns[:3]) if columns else ()

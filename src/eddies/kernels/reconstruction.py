@@ -65,7 +65,7 @@ def sums_on_grid(library: ctypes.CDLL, grid: GridPlanes, numbers: tuple[float, .
 def fitted(library: ctypes.CDLL, box: Box, degree: int, numbers: tuple[float, ...], volume: float, ridge: float,
            offsets: np.ndarray, senders: np.ndarray, receivers: np.ndarray, positions: np.ndarray,
            values: np.ndarray) -> np.ndarray:
-    """Moving least squares of three components, (n, 4, 3): their values, then their derivatives along x, y and z.
+    """Moving least squares fit of a vector at each receiver, (n, 4, 3): the vector, then its x, y and z derivatives.
 
     `eddies.particles.particle_field.ParticleField.fitted` defines the fit. `numbers` are the weight W as
     `kernel_numbers` returns it, `volume` is the mean volume of a particle. `offsets` (n + 1,) and `senders` (m,) list

@@ -16,10 +16,10 @@ PADDING = 8
 
 @dataclass(frozen=True)
 class PaddedPlanes:
-    """Consecutive planes that a rank holds of a periodic grid of `cells`^3 points: `planes` of them, from `lowest` on.
+    """Consecutive planes of a periodic grid of `cells`^3 points that a rank holds: its own and ghost planes.
 
-    The methods of `Splines` take them as `parts`, three arrays (components, planes, y, x): ghosts below, own planes,
-    ghosts above.
+    `planes` is their number, `lowest` the index of the lowest one. The methods of `Splines` take them as `parts`, three
+    arrays (components, planes, y, x): ghosts below, own planes, ghosts above.
     """
 
     cells: int
@@ -29,7 +29,7 @@ class PaddedPlanes:
 
 
 class MisplacedPoint(ValueError):
-    """A point is not finite, or its splines reach beyond the planes; `number` is the first such point."""
+    """A point is not finite, or its splines reach beyond the planes; `number` is the index of the first such point."""
 
     def __init__(self, number: int) -> None:
         super().__init__(f"point {number} has no place among the planes")
@@ -67,7 +67,7 @@ class Splines:
         return values
 
     def slope(self, parts: Sequence[np.ndarray], factors: np.ndarray) -> np.ndarray:
-        """Gradient (n, 3) by position of sum_c factors_c f_c, with interpolated fields f_c and fixed factors (n, c)."""
+        """Spatial gradient (n, 3) of sum_c factors_c f_c, with interpolated fields f_c and fixed `factors` (n, c)."""
         gradients = np.empty((self._cloud.points, 3))
         self._call("splines_slope", _contiguous(parts), np.ascontiguousarray(factors, np.float64), gradients)
         return gradients / self._padded.spacing
@@ -77,7 +77,7 @@ class Splines:
         self._call("splines_spread", parts, np.ascontiguousarray(values, np.float64))
 
     def _call(self, name: str, parts: Sequence[np.ndarray], *columns: np.ndarray) -> None:
-        """Call a function with the addresses of planes (components, planes) and with columns of points."""
+        """Call a library function with the address of each plane of each component and with `columns` of the points."""
         kind = parts[0].dtype
         if any(part.dtype != kind or not part[0, 0].flags.c_contiguous for part in parts):
             raise ValueError(f"planes of {[part.dtype for part in parts]}: contiguous planes of one type are needed")

@@ -39,7 +39,10 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class KernelNeighborhood:
-    """Halo and neighbour list within a kernel's support; position (s, 3) and volumes (s,) of particles, then ghosts."""
+    """Halo and neighbour list that reach as far as the support of a kernel.
+
+    `position` (s, 3) and `volumes` (s,) hold the owned particles first, then the ghosts.
+    """
 
     kernel: SmoothingKernel
     neighborhood: Neighborhood
@@ -49,7 +52,7 @@ class KernelNeighborhood:
 
 @dataclass(frozen=True)
 class FieldLater:
-    """Particles and filtered flow one frame after the training frame, the frame to which the model is fitted.
+    """Particles and filtered flow one frame after the training frame, whose true rates the model is fitted to.
 
     Parameters
     ----------
@@ -74,7 +77,7 @@ class TrainingFrame:
     ----------
     dynamics : evaluates the model on the slabs of the particles. Each frame needs dynamics of its own.
     particles : the particles at the time of the frame.
-    acceleration, density_rate : true rates (n, 3) and (n,); no density rate if no term reads the density.
+    acceleration, density_rate : true rates (n, 3) and (n,); the density rate is None if no term reads the density.
     later : the filtered flow that the field loss compares with; if None, this loss compares with the true particles.
 
     `acceleration_rms` and `density_rate_rms` are the rms of one component of the true rates over all ranks. `total` is
@@ -111,7 +114,7 @@ class TrainingFrame:
         return velocity * (self.model.flow.scales.filter_width / self._rms(velocity)[0] ** 3)
 
     def rows(self, ids: np.ndarray) -> Tensor:
-        """Rows of the particles with these ids that this rank owns."""
+        """Indices of those particles of this rank whose id is among `ids`."""
         wanted = torch.from_numpy(ids).to(self._sorted_ids.device)
         place = torch.searchsorted(self._sorted_ids, wanted)
         inside = place < len(self._sorted_ids)
@@ -120,7 +123,7 @@ class TrainingFrame:
 
     @property
     def averaged(self) -> ParticleSet:
-        """The particles at the positions of the field loss: those of the next frame if `later` is given."""
+        """The particles at the positions that the field loss uses: their positions in `later` if it is given."""
         return self.particles if self.later is None else replace(self.particles, position=self.later.position)
 
     @torch.no_grad()
@@ -131,7 +134,7 @@ class TrainingFrame:
         """
         if self._within is None or self._within.kernel is not kernel:
             around, averaged = self.dynamics.neighborhood, self.averaged
-            # The model's list is used if it reaches as far and belongs to the same positions.
+            # The model's list is used if it reaches as far as the kernel and belongs to the same positions.
             if around is None or around.cutoff < kernel.support * (1 - 1e-9) or self.later is not None:
                 around = Neighborhood(self.decomposition, kernel.support, 0.0)
                 around.update(averaged)
@@ -168,9 +171,9 @@ class ForceTrainer:
 
     Parameters
     ----------
-    model, frames : the model, and its frames, all on the same slabs.
-    kernel : kernel of the field loss; None without this loss. The points of the loss are those of the filtered field;
-        without one, a grid with about as many points as there are particles.
+    model, frames : the model and the training frames, all on the same slabs.
+    kernel : kernel of the field loss; None without this loss. The loss is evaluated at the points of the filtered
+        field or, if frames have none, on a grid with about as many points as there are particles.
     weights : weights of the losses.
     batch : number of particles in a step without the field loss.
     """
@@ -188,7 +191,7 @@ class ForceTrainer:
     def trajectory_step(self, optimizer: Adam, step: int) -> dict[str, float]:
         """One optimiser step on the trajectory loss (Eq. 12) and the power loss of a random batch.
 
-        Returns the weighted sum "loss", each unweighted loss, such as "power_loss", and "gradient_norm".
+        Returns a dict: "loss", the weighted sum; each unweighted loss, such as "power_loss"; and "gradient_norm".
         """
         frame, random = self._drawn(step)
         rows = frame.rows(random.choice(self.total, self.batch, replace=False))
@@ -205,7 +208,7 @@ class ForceTrainer:
     def one_step_error(self, frame: TrainingFrame, most: int) -> float:
         """Normalised L2 error of the acceleration on a fixed sample of at most `most` particles of a frame; collective.
 
-        With a power loss, the result is the root of the squared error plus the weighted power loss.
+        With a power loss, the result is the root of a sum: the squared error plus the weighted power loss.
         """
         count = min(most, self.total)
         rows = frame.rows(np.random.default_rng(self.seed).choice(self.total, count, replace=False))
@@ -279,7 +282,7 @@ class ForceTrainer:
         return power.square().sum() / self.comm.size  # every rank has the whole, so its share is an equal part
 
     def _field_share(self, frame: TrainingFrame, rows: Tensor, error: Tensor, inside: Tensor) -> Tensor:
-        """This rank's share of Eq. 13 per time step: a mean squared error in units of the mean square acceleration.
+        """This rank's share of Eq. 13 with errors divided by the time step, in units of the mean square acceleration.
 
         The mean is over the grid points `inside` of all ranks. <.> is the kernel average.
 

@@ -24,7 +24,7 @@ class KernelLossWeights:
 
 
 class KernelSample:
-    """A filtered field on the grid points of a slab and the particles in it, at one time.
+    """A filtered field on the grid points of a slab, and the particles in this slab, at one time.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class KernelSample:
         self.mean_square = self._mean_squares(self.field, self.gradient)
 
     def own_rows(self, points: np.ndarray) -> Tensor:
-        """Rows in `field` of those `points` that this slab holds; `points` are numbers in the whole grid, z slowest."""
+        """Rows in `field` of those `points` that this slab holds; `points` are indices in the whole grid, z slowest."""
         n = self.decomposition.planes
         own = points[(points // n**2 >= self.decomposition.start) & (points // n**2 < self.decomposition.stop)]
         return torch.from_numpy(own - self.decomposition.start * n**2)
@@ -69,7 +69,7 @@ class KernelTrainer:
         self.points, self.seed = min(points, self.total), seed
 
     def step(self, optimizer: Adam, step: int) -> dict[str, float]:
-        """One step; returns the global losses, and the norm of the gradient."""
+        """One step. Returns by name the weighted sum "loss", each unweighted global loss, and "gradient_norm"."""
         random = np.random.default_rng([self.seed, step])
         sample = self.samples[random.integers(len(self.samples))]
         rows = sample.own_rows(np.sort(random.choice(self.total, self.points, replace=False)))

@@ -39,7 +39,7 @@ class Adam:
         """One step down the gradient of the sum of all shares; returns the norm of that gradient."""
         for parameter in self.parameters:
             parameter.grad = None
-        if share.requires_grad:  # a loss of single frames may not depend on any parameter
+        if share.requires_grad:  # otherwise no parameter affects this rank's share
             share.backward()
         # A rank whose share does not depend on a parameter still takes part in the sum.
         gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in self.parameters]

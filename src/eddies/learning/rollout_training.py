@@ -20,7 +20,7 @@ from eddies.particles.integrators import Integrator
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
 
-# Smallest mean energy decay of a band, as a share of the largest one. Smaller decays are raised to it.
+# Lower bound of a band's mean energy decay, as a share of the largest decay. Smaller decays are raised to this bound.
 SLOWEST = 0.1
 
 
@@ -49,17 +49,17 @@ class RolloutTrainer:
     loss of frame k is <|v - v_true|^2> / <|v_true - v_start|^2>. It is 1 for particles without acceleration, so all
     frames count alike. A density whose rate is learned has a loss of the same form.
 
-    The energy loss is the squared error of the kinetic energy of a band of wavenumbers, averaged over the bands. Its
-    unit is the energy that the band loses on average from the start to the frame. Fitted forces are attenuated where
-    their features are noisy: they take too much energy from some scales and too little from others. The error of the
-    velocity hardly shows this.
+    The energy loss is the squared error of the kinetic energy in a band of wavenumbers, averaged over the bands. The
+    error is in units of the energy that the band loses on average from the start to the frame. Fitted forces are
+    attenuated where their features are noisy: they take too much energy from some scales and too little from others.
+    The error of the velocity hardly shows this.
 
     The gradient goes through all steps: force, neighbours, halo, and the grid of the resolved velocity. The backward
     pass computes each step again, so that memory holds the intermediate results of only one step.
 
     Parameters
     ----------
-    integrator : advances particles by dynamics with `fixed_ranks`.
+    integrator : advances the particles; its dynamics must have `fixed_ranks`.
     windows : true trajectories, on the slabs of the dynamics.
     frame_interval, steps_per_frame : time between frames, and number of time steps in it.
     energy_weight : weight of the energy loss; if it is zero, windows need no energies.
@@ -109,7 +109,7 @@ class RolloutTrainer:
 
     def _energy_share(self, window: TrainingWindow, frame: int, particles: ParticleSet) -> Tensor:
         """This rank's share, an equal part, of the mean squared error of the energies of the bands."""
-        # The solve for the resolved velocity starts from zero, as for the truth: a prediction would change the
+        # The solve for the resolved velocity starts from zero, as for the true energies: a prediction would change the
         # energies. In the backward pass the solve starts from its own solution and takes no iteration.
         near: Tensor | None = None
 
@@ -134,7 +134,7 @@ class RolloutTrainer:
             yield reached, particles
 
     def _advanced(self, particles: ParticleSet, memory: dict[str, Tensor]) -> tuple[ParticleSet, dict[str, Tensor]]:
-        """One time step; only its end is kept for the gradient."""
+        """The particles and the integrator's memory after one time step. The backward pass computes the step again."""
         given, carried, after = particles.columns(), list(memory), ([], [])
         state = self.integrator.dynamics.state_dict()
         del given["id"]
@@ -172,9 +172,9 @@ UNWRAPPED = getattr(checkpoint, "__wrapped__", checkpoint)
 
 
 def mean_losses(windows: Sequence[TrainingWindow], stationary: bool = False) -> Tensor:
-    """Change of ln(energy) of each band per frame, as a magnitude (bands,), at least SLOWEST times the largest.
+    """Typical change of ln(energy) per frame in each band (bands,), at least SLOWEST times that of the fastest band.
 
-    It is the absolute value of the mean over windows, or the rms over windows if `stationary`.
+    The change is the absolute value of the mean over windows, or the rms over windows if `stationary`.
     """
     changes = torch.stack([window.energies[-1] / window.energies[0] for window in windows]).log()
     change = changes.square().mean(0).sqrt() if stationary else changes.mean(0)
@@ -183,7 +183,7 @@ def mean_losses(windows: Sequence[TrainingWindow], stationary: bool = False) -> 
 
 
 def _recomputed(function: Callable[..., Any], *columns: Tensor) -> Any:
-    """The result of a function. Its intermediate results are not kept: it is called again for the gradient."""
+    """Return function(*columns). Its intermediate results are not stored: the backward pass calls it again."""
     if not torch.is_grad_enabled():
         return function(*columns)
     return UNWRAPPED(function, *columns, use_reentrant=False, preserve_rng_state=False)

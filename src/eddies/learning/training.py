@@ -25,8 +25,9 @@ class Phase:
     name : name in the progress line.
     work : (steps,), cost of each optimiser step in a unit common to all phases, to estimate the time left.
     rates : learning rate of the first and of the last step.
-    take : takes one step of the optimiser, given its number within the phase; returns losses by name.
-    validate : returns the error on held-out data. The phase ends with the state of least error; if None, with the last.
+    take : takes an optimiser step, given the optimiser and the step's number in the phase; returns losses by name.
+    validate : returns the error on held-out data. The phase ends with the state of least error; if `validate` is
+        None, with the last state.
     validate_every : steps between two validations; the last step is validated too.
     patience : the phase ends after this many steps without a smaller validation error; if None, after all steps.
     """
@@ -50,7 +51,7 @@ class TrainingDiverged(ValueError):
 
 
 class Training:
-    """Trains a model in phases, in order, each of at least one step.
+    """Trains a model in phases, one after the other. Each phase has at least one step.
 
     A validated phase ends with its state of least error, which may be the state before its first step. All ranks hold
     the same state.
@@ -74,7 +75,7 @@ class Training:
 
     @property
     def running(self) -> bool:
-        """Whether a phase is left."""
+        """Whether an unfinished phase remains."""
         return self.phase_number < len(self.phases)
 
     @property
@@ -138,7 +139,7 @@ class Training:
         return finished
 
     def columns(self) -> dict[str, np.ndarray]:
-        """The history by column; NaN where a row has no such number."""
+        """The history as arrays (steps,) by name; NaN at steps that have no such number."""
         names = sorted({name for row in self.history for name in row})
         return {name: np.array([row.get(name, np.nan) for row in self.history]) for name in names}
 

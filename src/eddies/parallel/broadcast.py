@@ -55,7 +55,7 @@ def on_first_rank(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
 
 
 def on_all_ranks(comm: MPI.Comm, action: Callable[[], Result], kind: type[Exception] = OSError) -> Result:
-    """Run an action on all ranks and return its result on this one.
+    """Run an action on all ranks; each rank returns its own result.
 
     If some ranks raise an error of class `kind`, all ranks raise it, with the text of the lowest of these ranks.
     """

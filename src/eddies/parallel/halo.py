@@ -14,7 +14,7 @@ class HaloError(UserError, ValueError):
 
 
 class HaloExchange:
-    """Exchange of ghosts, the neighbouring ranks' particles within `width` of this slab; planned once for any column.
+    """Exchange of ghosts: the neighbouring ranks' particles within `width` of this slab. One plan serves all columns.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class HaloExchange:
         self.count = self._from_above + self._from_below
 
     def forward(self, owned: np.ndarray) -> np.ndarray:
-        """Return the ghost rows (count, ...) of a column of owned rows (n, ...)."""
+        """Return the ghost rows (count, ...) of a column; `owned` (n, ...) are its rows on this rank."""
         owned = np.asarray(owned)
         slab, tail = self.decomposition, owned.shape[1:]
         return np.concatenate([
@@ -64,7 +64,7 @@ class HaloExchange:
         ghosts = np.asarray(ghosts)
         slab, tail = self.decomposition, ghosts.shape[1:]
         owned = np.zeros((self.owned, *tail), ghosts.dtype)
-        # An owned row occurs at most once per face, so indexed addition leaves out no ghost.
+        # An owned row occurs at most once per face: indexed addition would leave out repeated rows.
         owned[self._down] += _exchange(slab, ghosts[: self._from_above], slab.above, slab.below,
                                        (len(self._down), *tail))
         owned[self._up] += _exchange(slab, ghosts[self._from_above :], slab.below, slab.above, (len(self._up), *tail))

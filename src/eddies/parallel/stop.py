@@ -109,7 +109,7 @@ class StopRequest:
         now = time.monotonic()
         if self.stop_file is not None and now >= self._next_look:
             self._next_look = now + LOOK_SECONDS
-            if os.path.exists(self.stop_file):  # unlike Path.exists this never raises on this rank alone
+            if os.path.exists(self.stop_file):  # unlike Path.exists, it never raises an error
                 return _FILE
         if now >= self._end:
             return _TIME

@@ -25,7 +25,7 @@ class Transpose:
     def __init__(self, comm: MPI.Comm, rows: int, columns: int, components: int, width: int, dtype: np.dtype) -> None:
         self._comm, rank, dtype = comm, comm.rank, np.dtype(dtype)
         z_counts, y_counts = np.diff(block_starts(rows, comm.size)), np.diff(block_starts(columns, comm.size))
-        # Counts are in lines of all components along x: in bytes they would exceed the range of MPI's integers.
+        # Counts are in lines along x with all components: counts in bytes would exceed the range of MPI's integers.
         self._line_bytes = components * width * dtype.itemsize
         self._column_lines, self._plane_lines = z_counts * y_counts[rank], y_counts * z_counts[rank]
         self._column_lines[rank] = self._plane_lines[rank] = 0

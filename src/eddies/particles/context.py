@@ -26,7 +26,8 @@ from eddies.particles.rates import described
 from eddies.particles.resolved_velocity import ResolvedFlow, ResolvedVelocity
 from eddies.scene.terms import TermError
 
-# Numbers in memory at once in sums over pairs without a gradient. They fit a core's cache, or a part of a GPU's memory.
+# Numbers that sums over pairs hold in memory at once if no gradient is recorded: they fit a core's cache, or part of a
+# GPU's memory.
 PAIR_VALUES_TOGETHER = {"cpu": 1 << 19, "cuda": 1 << 26}
 # This fraction of the values for evenly spread neighbours is added to moment matrices and sums of weights. They can
 # then be inverted even without neighbours or with only coplanar ones. In all other cases the bias is 0.1 %.
@@ -76,7 +77,7 @@ class Context:
     decomposition : slabs, with the communicator.
     particles : the owned particles.
     flow : units of the model.
-    local : the particles that this rank sees; None if no term reads pairs.
+    local : the s particles that this rank sees, owned ones and ghosts; None if no term reads pairs.
     resolution : finds the resolved velocity; None if no term reads it.
     rows : (k,), the particles for which acceleration and density rate are computed; None: all.
     dtype : type of the pair arithmetic; None: the type of the positions.
@@ -218,9 +219,9 @@ class Context:
         return ScaledPairs(pairs, self.column, self.flow)
 
     def pairs_in_blocks(self, width: int) -> Iterator[ScaledPairs]:
-        """Yield all pairs, in both orders, in at least one block of consecutive particles.
+        """Yield all pairs, in both orders, in one or more blocks. A block has the pairs of consecutive particles.
 
-        With `width` numbers per pair a block has about PAIR_VALUES_TOGETHER numbers.
+        With `width` numbers per pair, each block has about PAIR_VALUES_TOGETHER numbers.
         """
         together = max(PAIR_VALUES_TOGETHER[self.particles.position.device.type] // width, 1)
         for block in self.local.neighbors.blocks(together):

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 
 class DenseNetwork(nn.Module):
-    """Fully connected tanh layers and a linear output layer, with Glorot-normal weights and zero biases at first.
+    """Fully connected tanh layers and a linear output layer. Initial weights are Glorot-normal, initial biases zero.
 
     Features are along the first axis and points along the last: a layer is then one matrix product, and each feature
     and output is a contiguous array.
@@ -18,7 +18,7 @@ class DenseNetwork(nn.Module):
     ----------
     inputs, outputs : number of features and of outputs.
     hidden : widths of the hidden layers, at least one.
-    seed : of the initial weights. They are drawn in double precision; convert the module for another precision.
+    seed : seed of the initial weights. They are drawn in double precision; convert the module for another precision.
     """
 
     def __init__(self, inputs: int, hidden: Sequence[int], outputs: int, seed: int) -> None:

@@ -31,7 +31,7 @@ class ParticleDynamics:
         in double precision; only their differences are converted.
     fixed_ranks : whether particles keep their rank and row, as gradients through a few steps require. The halo then
         widens by the largest distance of a particle from its slab.
-    drift : if a term reads the resolved velocity, this distance may be at most skin/2 + `drift`.
+    drift : if a term reads the resolved velocity, a particle may be at most skin/2 + `drift` outside its slab.
 
     `time` is the time at the beginning of the present step; integrators advance it.
     """
@@ -62,7 +62,7 @@ class ParticleDynamics:
         self._local = None
 
     def built_at(self, particles: ParticleSet) -> Tensor | None:
-        """Positions (n, 3) of these particles at the last build of halo and list; None after a build for others."""
+        """Positions (n, 3) of these particles at the last build of halo and list; None if that was for others."""
         return None if self.neighborhood is None else self.neighborhood.built_at(particles)
 
     def rebuild(self, particles: ParticleSet, built_at: Tensor) -> None:
@@ -72,7 +72,7 @@ class ParticleDynamics:
             self.neighborhood.update(replace(particles, position=built_at))
 
     def begin(self) -> None:
-        """Begin a new run at time 0, without predictions."""
+        """Begin a new run at time 0, and discard the predictions of the resolved velocity."""
         self.time, self.evaluations = 0.0, 0
         if self.resolution is not None:
             self.resolution.forget()
@@ -92,9 +92,9 @@ class ParticleDynamics:
                companions: dict[str, Tensor] | None = None) -> tuple[ParticleSet, dict[str, Tensor]]:
         """Move particles to the ranks of their slabs if halo and list are outdated; collective.
 
-        Integrators call it before they evaluate the rates. `companions` are further columns (n, ...) that move with the
-        particles. Returns the particles and the companions. Nothing changes rank while a gradient is recorded, since a
-        change of rank would cut the gradient.
+        With a resolved velocity but no list, they move once a particle is outside its slab. Integrators call `settle`
+        before they evaluate the rates. `companions` are further columns (n, ...) that move with the particles. Returns
+        the particles and the companions. Nothing changes rank while a gradient is recorded: that would cut it.
         """
         companions = companions or {}
         if self.fixed_ranks:
@@ -120,9 +120,9 @@ class ParticleDynamics:
               density: Tensor | None = None, time: float | None = None) -> Rates:
         """Rates of change of the owned particles, or of `rows` (k,) of them; see LagrangianModel.rates.
 
-        `kept` holds stored rates by name of the term; they replace these terms. `density` (n,) replaces the density
-        that terms would give. If `time` is given, the solve for the resolved velocity starts from a prediction for this
-        time, made from earlier evaluations.
+        `kept` holds stored rates by name of the term; these terms are not evaluated. `density` (n,) replaces the
+        density that terms would give. If `time` is given, the solve for the resolved velocity starts from a prediction
+        for this time, made from earlier evaluations.
         """
         return self.model.rates(self.context(particles, rows, density, time), kept)
 

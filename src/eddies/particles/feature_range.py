@@ -1,4 +1,4 @@
-"""Range of the inputs on which a network was trained, and the share of later inputs outside it."""
+"""Range of the inputs on which a network was trained, and the share of later inputs outside this range."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from eddies.particles.particle_set import ParticleSet
 def pair_features(dynamics: ParticleDynamics, particles: ParticleSet) -> Iterator[Tensor]:
     """Yield the inputs of all networks of a model in blocks (features, m) of pairs; collective.
 
-    `particles` must have the density that the model sees. Each rank yields at least one block. Each pair appears in
-    both orders, on the rank that owns its first particle. Therefore counts do not depend on the number of ranks.
+    `particles` must have the density that the model's terms read. Each rank yields at least one block. Each pair
+    appears in both orders, on the rank that owns its first particle. So counts do not depend on the number of ranks.
     """
     terms = dynamics.model.networks
     context = dynamics.context(particles, density=particles.density)

@@ -12,9 +12,9 @@ from eddies.errors import UserError
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_sum
 
-# Upper limits of the highest wavenumber that particles resolve: in units of their Nyquist wavenumber; in units of
-# 1/eta, where the spectrum ends; and the wavenumber at which the filter's transfer function has its smallest allowed
-# value, since the closure divides by this function (docs/closure.md).
+# Three upper limits of the highest wavenumber that particles resolve: BEYOND_NYQUIST times their Nyquist wavenumber;
+# BEYOND_DISSIPATION / eta, where the spectrum ends; and the wavenumber at which the filter's transfer function falls to
+# LEAST_TRANSFER, since the closure divides by this function (docs/closure.md).
 BEYOND_NYQUIST, BEYOND_DISSIPATION, LEAST_TRANSFER = 1.5, 1.05, 0.02
 MAY_VANISH = ("viscosity", "kolmogorov_length")
 MEAN_DENSITY = 1.0
@@ -123,9 +123,9 @@ class FlowUnits:
 def measured_scales(comm: Comm, at: Columns, after: Columns, interval: float) -> dict[str, float]:
     """Rms of velocity, density and their rates over all particles; of vectors, the rms of one component. Collective.
 
-    Returns "velocity_rms" and "density_rms" (of the fluctuation) in the frame `at`. "acceleration_rms" and
-    "density_rate_rms" are those of the change to the frame `after`, divided by `interval`, the time between the frames.
-    Both frames are this rank's rows of `velocity` (n, 3) and, optionally, `density` (n,), of the same particles.
+    Returns "velocity_rms" and "density_rms" (of the fluctuation) in the frame `at`, and "acceleration_rms" and
+    "density_rate_rms": the rms of the change from `at` to the frame `after`, divided by `interval`, the time between
+    them. Both frames are this rank's rows of `velocity` (n, 3) and, optionally, `density` (n,), of the same particles.
     """
     scales = {}
     for name, rate in RATES.items():

@@ -22,7 +22,7 @@ from eddies.spectral.spectral_grid import SYMMETRIC, SpectralGrid
 
 
 class FourierGrid(ModeOperators):
-    """A periodic grid with as many cells along each axis as the slabs have planes, and the modes |k_i| <= `resolved`.
+    """A periodic grid with as many cells along each axis as all slabs have planes, and its modes |k_i| <= `resolved`.
 
     Fields are real tensors (c, z_local, y, x), modes complex ones (c, kz, ky, kx) as in `SpectralGrid`, on the host and
     in the precision of `dtype`. Values at positions are in double precision. Positions (n, 3) lie in this rank's
@@ -127,7 +127,7 @@ class Points:
         return torch.from_numpy(self._splines.at(parts)).to(self.position.device)
 
     def slope_along(self, parts: Sequence[np.ndarray], factors: Tensor) -> Tensor:
-        """Gradient (n, 3) by position of sum_c factors_c f_c, with interpolated fields f_c and fixed factors (n, c)."""
+        """Spatial gradient (n, 3) of sum_c factors_c f_c, with interpolated fields f_c and fixed `factors` (n, c)."""
         return torch.from_numpy(self._splines.slope(parts, as_numpy(factors.double()))).to(self.position)
 
     def spread(self, values: Tensor) -> Tensor:

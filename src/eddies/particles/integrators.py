@@ -32,7 +32,7 @@ class Integrator:
         self._last, self.memory = particles, memory
 
     def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:
-        """Particles between two steps, on the ranks of their slabs, and their rates; collective."""
+        """Move particles to the ranks of their slabs between two steps; return them and their rates. Collective."""
         if particles is not self._last or not self.memory:
             particles, _ = self.dynamics.settle(particles)
             self.restore(particles, _remembered(self.dynamics.rates_after(0.0, particles)))
@@ -55,9 +55,8 @@ class VelocityVerlet(Integrator):
     scheme = SCHEMES["verlet"]
 
     def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:
-        """Particles between two steps and their rates. The rates are evaluated again, because `memory` holds those at a
-        predicted velocity."""
-        if particles is not self._last:  # the last ones are on their ranks already
+        """As `Integrator.rates`, but evaluate the rates again: `memory` holds the rates at a predicted velocity."""
+        if particles is not self._last:  # the last particles are on their ranks already
             particles, _ = self.dynamics.settle(particles)
         return particles, self.dynamics.rates(particles, time=self.dynamics.time)
 
@@ -114,7 +113,7 @@ class RungeKutta(Integrator):
         return end
 
     def _settled(self, stage: ParticleSet, *others: ParticleSet) -> list[ParticleSet]:
-        """Move the particles of a stage to the ranks of their slabs, with the rows that they have in `others`."""
+        """Move the particles of a stage to the ranks of their slabs, and move their rows of `others` with them."""
         companions = {f"{number} {name}": column for number, other in enumerate(others)
                       for name, column in other.columns().items() if name != "id"}
         stage, moved = self.dynamics.settle(stage, companions)

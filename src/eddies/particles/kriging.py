@@ -14,18 +14,19 @@ from eddies.kernels import kriging as compiled
 from eddies.kernels.library import library
 from eddies.particles.pairs import Pairs
 
-# Rows of the weights for the field, for its first derivatives, for its second derivatives xx, xy, xz, yy, yz, zz, and
-# for the field together with its first derivatives.
+# Rows of the weights: OWN is for the field itself, FIRST for its first derivatives, and SECOND for its second
+# derivatives xx, xy, xz, yy, yz, zz. UP_TO_FIRST is OWN together with FIRST.
 OWN, FIRST, SECOND, UP_TO_FIRST = 0, slice(1, 4), slice(4, 10), slice(0, 4)
 # Row in SECOND of each entry (j, k) of the matrix of second derivatives.
 PLACES = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 
 # Ratio of the noise variance to the field variance. It must be so large because some random particles almost coincide.
 NOISE = 1e-3
-# The covariance is a sum of SCALES Gaussians. Each squared length is twice the one before. NARROWEST is the smallest,
-# in units of d^2/6, which is the squared length of white noise after the Gaussian filter.
+# The covariance is a sum of SCALES Gaussians. Each squared length is twice the one before, and NARROWEST is the
+# smallest. The unit is d^2/6, the squared correlation length of white noise after the Gaussian filter.
 NARROWEST, SCALES = 1.2, 6
-# Smallest own weight of a particle by which a residual is divided, in units of the inverse variance of the field.
+# A residual is divided by the particle's own weight, or by this value if the weight is smaller. The unit is the inverse
+# variance of the field.
 LEAST_WEIGHT = 0.01
 
 
@@ -44,10 +45,10 @@ def covariance(filter_width: float) -> tuple[float, np.ndarray]:
 def interpolated(pairs: Pairs, support: float, filter_width: float, values: Tensor) -> tuple[Tensor, Tensor]:
     """Kriging at points that are not particles: field (n, c) and gradient (n, c, 3) from the particles' values (s, c).
 
-    Both are sums sum_j w_j f_j with the weights of `kriging_weights`. For the field b_j is C(|x - x_j|), and for the
-    gradient the derivative of C(|x - x_j|) with respect to x. The weights of the field add up to one and those of the
-    gradient to zero, so a constant is exact. The result is NaN where the equations cannot be solved, and zero where no
-    particle lies within the support.
+    Both are sums sum_j w_j f_j with the weights w = K^-1 b of `kriging_weights`. For the field b_j is C(|x - x_j|). For
+    the gradient b_j is the derivative of C(|x - x_j|) with respect to the point x. The weights of the field add up to
+    one and those of the gradient to zero, so a constant is exact. The result is NaN where the equations cannot be
+    solved, and zero where no particle lies within the support.
     """
     _, weights = kriging_weights(pairs, support, filter_width, sited=False)
     sums = torch.from_numpy(compiled.weighted_sums(library(), pairs.offsets.numpy(), pairs.sender.numpy(), None,
@@ -62,11 +63,11 @@ def kriging_weights(pairs: Pairs, support: float, filter_width: float,
 
     K_jk is C(|x_j - x_k|) (see `covariance`), plus NOISE / max(1 - (r/support)^4, 1e-4) on the diagonal. This noise
     of a particle grows with its distance r from the receiver, so neighbours enter and leave the support without a jump.
-    If the receiver is a particle (`sited`), its own value f_i is among the f_j. In the row of the field b is then 1 for
-    the particle and 0 for its neighbours. This row gives w_i times the difference between f_i and the neighbours'
-    estimate. In the rows of derivatives b is the derivative of C(|x - x_j|) with respect to x. The mean of f is
-    unknown: a multiple of K^-1 1 is subtracted so that the weights add up to zero, or to one in the row of the field
-    if the receiver is not a particle (ordinary kriging).
+    If the receiver x is a particle i (`sited`), its own value f_i is among the f_j. For the field, b is then 1 for the
+    particle and 0 for its neighbours. The sum is then w_i times the difference between f_i and the neighbours'
+    estimate. For derivatives, b is the derivative of C(|x - x_j|) with respect to x. The mean of f is unknown. So a
+    multiple of K^-1 1 is subtracted to make the sum of the weights zero. For the field at a receiver that is no
+    particle, the weights add up to one instead (ordinary kriging).
 
     Returns
     -------

@@ -75,13 +75,13 @@ class LeastSquares:
         return self.grid.solenoidal(modes) * self._inside
 
     def preconditioner(self, count: float) -> Tensor:
-        """1 / (N + 5 penalty), approximately the inverse of A for N = `count` points; 0 outside."""
+        """1 / (N + 5 penalty), approximately the inverse of A for N = `count` points; 0 for modes not solved for."""
         return torch.where(self.inside, 1 / (count + SMOOTHING * self.penalty), 0.0)
 
     def size(self, residual: Tensor, count: float) -> float:
         """Squared norm of a residual on all ranks, with the preconditioner as weight; collective.
 
-        It is comparable to sum_i |v_i|^2.
+        The result is comparable to sum_i |v_i|^2.
         """
         square = residual.real.square() + residual.imag.square()
         weighted = self.grid.multiplicity * self.preconditioner(count) * square

@@ -23,7 +23,7 @@ from eddies.particles.terms.resolved_forces import Forcing
 from eddies.particles.terms.term import PairTerm, Term
 from eddies.scene.terms import TermError, TermSettings
 
-#: The built-in terms by their words in [model] terms. Their classes are in the modules of eddies.particles.terms.
+#: The built-in terms, by the words that name them in a scene. Their classes are in modules of eddies.particles.terms.
 TERMS: dict[str, type[Term]] = {
     kind.Settings.word: kind
     for module in iter_modules(built_in.__path__)
@@ -61,7 +61,7 @@ class LagrangianModel(nn.Module):
                 raise TermError(f'term "{name}": both reads and gives the density; it can do only one of the two')
 
     def forced(self, settings: TermSettings | None) -> LagrangianModel:
-        """Model of the same terms (not copies) plus a forcing with these settings; this model if they are None."""
+        """Model of the same terms (not copies) plus a forcing with these settings; this model if `settings` is None."""
         if settings is None:
             return self
         return LagrangianModel({**self.terms, FORCING: Forcing(settings, self.flow)}, self.flow)
@@ -123,9 +123,10 @@ class LagrangianModel(nn.Module):
     def rates(self, context: Context, kept: Mapping[str, LinearRates] | None = None) -> Rates:
         """Sum of the terms; differentiable, collective.
 
-        The result has `acceleration` (k, 3), which includes `force_modes`, and `density_rate` (k,) and a shift if a
-        term gives them. A `density` that terms give is the whole density (n,), not its deviation. `kept` holds
-        results of `linear_rates` by name of the term; each replaces the evaluation of that term.
+        The result has the `acceleration` (k, 3) of the k requested particles, which includes the force of
+        `force_modes`. It has `density_rate` (k,), `shift_velocity` and `shift_acceleration` if a term gives them. A
+        `density` that terms give is the whole density (n,), not its deviation. `kept` holds results of
+        `linear_rates` by name of the term; each replaces the evaluation of that term.
         """
         kept, sums = kept or {}, []
         for stage in self._stages if self.density_is_given and context.density is None else [list(self.terms.items())]:
@@ -203,7 +204,7 @@ class LagrangianModel(nn.Module):
             direct = self._with_parameters(term, context, others)
             context.forget_sums(term)
             expected = replace(kept, parameters=others).at(None)
-            # Norms over this rank's particles are compared: at a single particle only rounding errors may be left.
+            # Norms over this rank's particles are compared: the rates of one particle may be rounding errors only.
             wrong = [rate for rate in STORED if getattr(direct, rate) is not None and not (
                 (getattr(expected, rate) - getattr(direct, rate)).norm() <= 1e-3 * getattr(direct, rate).norm())]
             if any_rank(context.comm, bool(wrong)):
@@ -212,7 +213,7 @@ class LagrangianModel(nn.Module):
 
     @property
     def _stages(self) -> list[list[tuple[str, Term]]]:
-        """The terms that do not read the density, then those that do."""
+        """Two lists of (name, term): the terms that do not read the density, and those that do."""
         stages: list[list[tuple[str, Term]]] = [[], []]
         for name, term in self.terms.items():
             stages["density" in term.settings.reads].append((name, term))
@@ -305,7 +306,7 @@ def _evaluated(term: Term, context: Context) -> Rates:
 
 
 def _checked(term: Term, context: Context, evaluate: Callable[[], object]) -> Rates:
-    """The rates that a term gives. Raises TermError, which names the class of the term, if it fails, or if it does not
+    """The rates that a term gives. Raises TermError, with the name of the term's class, if the term fails or does not
     return Rates of the declared kinds with one row for each particle."""
     name, gives = type(term).__name__, term.settings.gives
     with users_code(type(term), TermError):

@@ -16,9 +16,9 @@ from eddies.particles.rates import Rates
 
 @dataclass(frozen=True)
 class Moment:
-    """This rank's block of all particles at a moment.
+    """The particles at a moment, divided among the ranks in blocks by id: the block of this rank.
 
-    A block holds consecutive ids, in order; its particles may lie in any slab.
+    A block holds particles with consecutive ids, in order of id. They may lie in any slab.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def between(before: Moment, after: Moment, time: float, box: PeriodicBox) -> Par
     step = after.time - before.time
     theta = (time - before.time) / step
     first, last, pull, last_pull = before.velocity, after.velocity, before.acceleration, after.acceleration
-    if before.shift is not None:  # its rate is unknown; its mean rate over the interval replaces it
+    if before.shift is not None:  # the shift's rate of change is unknown; the mean rate replaces it
         first, last, turning = first + before.shift, last + after.shift, (after.shift - before.shift) / step
         pull, last_pull = pull + turning, last_pull + turning
     kick, drift = step * pull, step * first

@@ -16,12 +16,12 @@ def weight(distance: Tensor, cutoff: float) -> Tensor:
 
 
 def expected_weight(neighbors: float) -> float:
-    """Sum of w over `neighbors` evenly spread particles within the cutoff: 3 int q^2 w dq = 8/35 each."""
+    """Sum of w over `neighbors` evenly spread particles within the cutoff; each adds 3 int q^2 w dq = 8/35."""
     return neighbors * 8 / 35
 
 
 def expected_moment(neighbors: float, cutoff: float) -> float:
-    """Diagonal entry of sum w x x^T for evenly spread neighbours: int q^4 w dq = 8/315 of cutoff^2 each."""
+    """Diagonal entry of sum w x x^T for evenly spread neighbours; each adds cutoff^2 int q^4 w dq = 8/315 cutoff^2."""
     return neighbors * cutoff**2 * 8 / 315
 
 

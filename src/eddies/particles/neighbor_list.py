@@ -28,7 +28,8 @@ class NeighborList:
     cutoff : radius within which pairs interact.
     skin : extra radius. The list remains valid until a particle has moved by `skin`/2.
 
-    Raises ValueError unless the radius is positive and less than half the box, where nearest images are unique.
+    Raises ValueError unless `cutoff` is positive, `skin` is not negative, and their sum is less than half the box.
+    Nearest images are unique within this distance.
     """
 
     def __init__(self, box: PeriodicBox, cutoff: float, skin: float) -> None:
@@ -40,12 +41,12 @@ class NeighborList:
     def build(self, receivers: Tensor, senders: Tensor, exclude_self: bool) -> None:
         """List the pairs of receivers (n, 3) and senders (s, 3).
 
-        With `exclude_self`, receiver row i is sender row i, and a particle is not its own neighbour. Raises ValueError
+        With `exclude_self`, receiver i and sender i are one particle, which is not its own neighbour. Raises ValueError
         if a position is not finite.
         """
         if not (torch.isfinite(receivers).all() and torch.isfinite(senders).all()):
             raise ValueError("neighbour list: a position is not finite")
-        # A slightly larger radius: only `pairs` decides what is within the cutoff, alike for (i, j) and (j, i).
+        # The radius is slightly larger, so only `pairs` decides which pairs count, alike for (i, j) and (j, i).
         reach = (self.cutoff + self.skin) * (1 + 1e-9)
         columns = neighbors_within(library(), self.box, reach, as_numpy(receivers), as_numpy(senders), exclude_self)
         self.offsets, self.senders = (torch.from_numpy(column).to(receivers.device) for column in columns)
@@ -64,11 +65,11 @@ class NeighborList:
 
     def pairs(self, receivers: Tensor, senders: Tensor, rows: Tensor | slice | None = None,
               dtype: torch.dtype | None = None) -> Pairs:
-        """Return the pairs that lie within the cutoff now; differentiable in the positions.
+        """Return the pairs that lie within the cutoff at these positions; differentiable in the positions.
 
         Parameters
         ----------
-        receivers, senders : (n, 3) and (s, 3), the present positions of the rows that the list was built from.
+        receivers, senders : (n, 3) and (s, 3), present positions of the particles that the list was built from.
         rows : receivers to keep, as row numbers (k,) or a slice. Output row i belongs to the i-th of them.
         dtype : type of displacement and distance; by default the type of the positions. Positions are
             subtracted before the conversion, so the size of the box costs no accuracy in single precision.

@@ -93,8 +93,8 @@ class Neighborhood:
         return self._built_at if particles.id is self._ids else None
 
     def outdated(self, particles: ParticleSet) -> bool:
-        """Whether, on any rank, the last build was for other particles, or one has moved since by more than half the
-        skin or to NaN."""
+        """Whether, on any rank, the last build was for other particles, or a particle has moved since by more than half
+        the skin, or has a position of NaN."""
         distance = math.inf
         if particles.id is self._ids:
             moved = self.box.displacement(particles.position.detach(), self._built_at)
@@ -105,8 +105,8 @@ class Neighborhood:
         """Rebuild halo and list if they are outdated. No particle changes rank.
 
         If particles are outside their slabs, the halo is wider by their largest distance from the slab, and slabs must
-        be thicker by twice that distance. Otherwise particles of the ranks below and above a slab could be neighbours
-        within it, and these two ranks exchange no ghosts. Raises HaloError on all ranks if slabs are too thin, a
+        be thicker by twice that distance. In thinner slabs a particle of the rank below and one of the rank above could
+        be neighbours, and these two ranks exchange no ghosts. Raises HaloError on all ranks if slabs are too thin, a
         position is not finite, or a particle is farther outside its slab than the box is long.
         """
         if not self.outdated(particles):
@@ -165,7 +165,7 @@ def at_home(decomposition: SlabDecomposition, columns: dict[str, Tensor], reach:
     moved = migrate(decomposition, {name: as_numpy(column) for name, column in columns.items()})
     ids = moved["id"]
     numbers = int(ids.max(initial=0)) + 1
-    # Few enough cells for cell and id to fit one integer: one sort key is much faster than four.
+    # The number of cells is limited so that cell and id fit one integer: one sort key is much faster than four.
     cells = max(min(int(decomposition.length / reach), int((2**63 / numbers) ** (1 / 3)) - 1), 1)
     x, y, z = np.minimum((moved["position"].T * (cells / decomposition.length)).astype(np.int64), cells - 1)
     order = np.argsort(((z * cells + y) * cells + x) * numbers + ids)

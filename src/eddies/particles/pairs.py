@@ -143,7 +143,7 @@ class ScaledPairs:
         return moments.weight(self.pairs.distance, self.flow.cutoff)
 
     def invariants(self, names: Sequence[str], symmetric: bool) -> Tensor:
-        """Inputs of a network for each pair, (features, m), in the order of INPUTS of the settings.
+        """The inputs `names` of a network for each pair, (features, m), in the order of `eddies.scene.terms.INPUTS`.
 
         "density" gives two features: rho'_i and rho'_j, or, if `symmetric`, rho'_i + rho'_j and (rho'_i - rho'_j)^2.
         The symmetric features are equal for (i, j) and (j, i). All other features are always symmetric.

@@ -24,7 +24,8 @@ from eddies.particles.smoothing_kernels import HermiteKernel, SmoothingKernel
 
 # Number of pairs evaluated together where no gradient is recorded: they fill about the cache of a core.
 PAIRS_TOGETHER = 1 << 16
-# Number of pairs evaluated together in kriging, with ten weights per pair: enough receivers for all threads.
+# Number of pairs evaluated together in kriging, with ten weights per pair. They belong to enough receivers for all
+# threads.
 KRIGED_TOGETHER = 1 << 20
 # Ridge of moving least squares. Smaller values do not change the errors of a filtered field. Where particles gather
 # because no force acts on them, the ridge bounds the gradients.
@@ -32,10 +33,10 @@ RIDGE = 1e-4
 
 
 class ParticleField:
-    """This rank's particles with the ghosts within `support`, and the grid points among them, on the host.
+    """This rank's particles, the ghosts within `support` of its slab, and the grid points in the slab, on the host.
 
-    Along each axis the grid has one cell for each plane of the slabs. The numbers of its points on this rank vary
-    slowest with z.
+    Along each axis the grid has one cell for each plane of the slabs. Its points on this rank are numbered in the order
+    z, y, x, with x fastest.
 
     Parameters
     ----------

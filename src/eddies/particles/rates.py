@@ -23,7 +23,7 @@ class Rates:
     force_modes : Fourier modes (3, kz, ky, kx) of an acceleration on the grid of the resolved velocity.
     pressure_modes : modes (kz, ky, kx) of a pressure p divided by the mean density; p / c^2 is added to the density.
     shift_velocity : (n, 3), velocity of the particles relative to the fluid, dx/dt = v + shift_velocity.
-    shift_acceleration : (n, 3), change of the fluid velocity v at a particle due to the shift.
+    shift_acceleration : (n, 3), rate of change of the fluid velocity v at a particle due to the shift.
 
     Modes of all terms are added before they are interpolated to the particles.
     """

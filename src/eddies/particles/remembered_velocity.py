@@ -35,9 +35,9 @@ class RememberedVelocity:
     ----------
     solver : estimates the first frame, which has no forecast. Its grid, prior and tolerance serve all frames.
     viscosity : nu.
-    transfer : G (kz, ky, kx), transfer function of the filter of the particles' velocity; 1 without a filter.
+    transfer : G (kz, ky, kx), transfer function of the filter that the particles' velocity has passed; 1 without one.
     memory : C.
-    weight : factor of the noise in the solver, sigma^2 / e; here a value below 1 is replaced by 1.
+    weight : factor of the noise in the solver, sigma^2 / e; in V a value below 1 is replaced by 1.
 
     All methods are collective.
     """
@@ -82,8 +82,8 @@ class RememberedVelocity:
         return modes
 
     def state_dict(self) -> dict[str, Any]:
-        """State for the next moment, empty before the first: tensors `modes` and `penalty` of the latest estimate, and
-        plain values, its `time`, the particles' mean velocity `drift` and their number `count`."""
+        """State for the next moment; empty before the first. `modes` and `penalty` are tensors of the latest estimate.
+        `time`, the particles' mean velocity `drift` and their number `count` are plain values."""
         if self._latest is None:
             return {}
         time, modes, drift = self._latest

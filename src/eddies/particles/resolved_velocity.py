@@ -113,7 +113,7 @@ class ResolvedFlow:
 
     @cached_property
     def smallest_rms(self) -> Tensor:
-        """Root mean square of a component of the smallest scales, the modes of u* with |k| > k_c/2."""
+        """Root mean square of a velocity component of the smallest scales, the modes of u* with |k| > k_c/2."""
         return self._rms_of(self.unfiltered, self.grid.resolved / 2)
 
     def mean_square(self, modes: Tensor, above: float, below: float = math.inf) -> Tensor:
@@ -126,7 +126,7 @@ class ResolvedFlow:
         return sum_over_ranks(self.grid.decomposition.comm, torch.where(inside, square, 0.0).sum(dtype=torch.float64))
 
     def _rms_of(self, modes: Tensor, above: float) -> Tensor:
-        # For a fluid at rest the derivative of the root is zero.
+        # The lower bound makes the derivative of the root zero for a fluid at rest.
         return (self.mean_square(modes, above) / 3).clamp_min(1e-300).sqrt()
 
 
@@ -138,22 +138,23 @@ class ResolvedVelocity:
     as for measured particle tracks (Gesemann et al. 2016). The velocities v_i are relative to their mean over all
     particles. P_k ~ k^(-11/3) f(k eta) G^2 is the expected energy of a component of a mode, f the dissipation range
     of the spectrum, and G the transfer function of the filter. sigma^2 is `weight` times the energy of a velocity
-    component that this law predicts beyond k_c; this energy acts as noise on the modes within. Since the filtered
+    component that this law predicts beyond k_c; this energy acts as noise on the modes up to k_c. Since the filtered
     velocity is smooth and solenoidal, modes beyond the particles' Nyquist wavenumber are determined too.
 
     The solve uses conjugate gradients, preconditioned by 1 / (N + 5 sigma^2/P_k). It ends when the preconditioned
     residual is `tolerance` times the velocities, or after a given number of `iterations`. A solve that starts from a
-    prediction (`predicted`) or from given modes ends at `tolerance_predicted`, a backward pass at `tolerance_adjoint`.
+    prediction (`predicted`) or from given modes has the tolerance `tolerance_predicted`. The solve in a backward pass
+    has the tolerance `tolerance_adjoint`.
 
-    Products of modes above a third of the number of cells are aliased. For fields known at particles this error is far
-    below the error of the highest modes themselves.
+    Products of modes above a third of the number of cells are aliased. For fields known at particles the aliasing error
+    is far below the error of the highest modes themselves.
 
     Parameters
     ----------
     grid : grid of the modes.
     filter_width : d of the filter.
     kolmogorov_length : eta of the flow; 0 if its spectrum has no dissipation range.
-    weight : factor of the noise.
+    weight : factor of the noise sigma^2.
 
     Differentiable in the particles' positions and velocities: the backward pass solves the same system. All methods are
     collective. Raises HaloError on all ranks if a particle is farther outside its slab than the ghost planes reach.
@@ -193,7 +194,8 @@ class ResolvedVelocity:
     def of(self, particles: ParticleSet, time: float | None = None, near: Tensor | None = None) -> ResolvedFlow:
         """The resolved flow of particles.
 
-        The solve starts from the prediction for `time`, from the modes `near` (3, kz, ky, kx), or from zero.
+        The solve starts from the prediction for `time` if this is given, else from the modes `near` (3, kz, ky, kx), or
+        from zero without either.
         """
         reach = self.grid.reach
         if farthest_outside(self.grid.decomposition, particles) >= reach:
@@ -221,7 +223,7 @@ class ResolvedVelocity:
     def band_energies(self, particles: ParticleSet, near: Tensor | None = None) -> Tensor:
         """Mean kinetic energy <u.u>/2 in bands of `BAND` wavenumber shells from shell 1 on: (bands,), over all ranks.
 
-        `near` as in `of`. Collective, differentiable.
+        `near` is as in `of`. Collective, differentiable.
         """
         spectrum = self.of(particles, near=near).spectrum[1:]
         return torch.nn.functional.pad(spectrum, (0, -len(spectrum) % BAND)).view(-1, BAND).sum(1)
@@ -245,8 +247,8 @@ class ResolvedVelocity:
 
         The nearer of the last two evaluations at different times is extrapolated with the rates of both (Adams and
         Bashforth). The field moves with the mean velocity (3,) of the particles. Each mode is multiplied by a
-        factor that decreases with its expected error. In a time dt a velocity equal to the rms `speed` u' of a
-        component turns the phase of a mode by theta = k u' dt. The relative error of the prediction is then (5/12)
+        factor that decreases with its expected error. A velocity u' = `speed`, the rms of a component, turns the phase
+        of a mode by theta = k u' dt in a time dt. The relative error of the prediction is then (5/12)
         theta^3; its rms over normally distributed velocities is 1.6 theta^3. The factor 1 / (1 + (2 theta)^6) removes
         modes that velocities of two or three u' would spoil. A wrong mode is worse than a missing one: the solve
         corrects it only near particles, and it grows elsewhere.
@@ -265,7 +267,7 @@ class ResolvedVelocity:
         """Discard predictions: the next solve starts from zero."""
         self._moments: list[_Moment] = []
         self.solves, self.latest = [], None
-        #: rms u' of a component of the resolved velocity last remembered; 0 before
+        #: rms u' of a component of the resolved velocity that was stored last; 0 if none was
         self.speed = 0.0
 
     def state_dict(self) -> dict[str, Tensor]:

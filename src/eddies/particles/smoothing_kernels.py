@@ -2,7 +2,7 @@
 
 Every kernel has unit integral over space, with W in units of 1/length^3, is nowhere negative, and is exactly zero for
 r >= support. The published form of the learned kernel is the exception: it may be negative, and the loss L_n brings its
-integral only near one. It has a `mean_volume` L^3/N, V_j of Eq. 6, and its sums are not normalised.
+integral only near one. It has a `mean_volume` L^3/N, the V_j of Eq. 6, and its sums are not normalised.
 """
 
 from __future__ import annotations
@@ -162,8 +162,8 @@ class HermiteKernel:
 
 
 class KernelNetwork(nn.Module):
-    """The learned kernel, with q = r/h: W(r) = alpha exp(NN(2 q^2 - 1)) g(q), alpha from the unit integral; or, with a
-    `mean_volume`, W(r) = NN(q) g(q) / h^3, Eq. 7 as published.
+    """The learned kernel: W(r) = alpha exp(NN(2 q^2 - 1)) g(q), where q = r/h and alpha makes the integral one. With a
+    `mean_volume`, W(r) = NN(q) g(q) / h^3 instead, Eq. 7 as published.
 
     Parameters
     ----------
@@ -171,12 +171,13 @@ class KernelNetwork(nn.Module):
     hidden : widths of the tanh layers.
     cutoff : "smooth": g = (1 - q^2)^2, zero with zero slope at q = 1; or "sigmoid", the paper's
         g = 1/(1 + exp(C (q - 1))), which is 1/2 at q = 1, so the kernel ends with a jump.
-    seed : of the initial weights.
+    seed : seed of the initial weights.
     mean_volume : L^3/N, for the published form of W, which may be negative; None for the positive form.
 
-    In the published form alpha is part of the output layer, which the loss L_n of Eq. 11 brings to the unit integral.
-    Volumes 1/sum W and normalised averages would fail in the published form: they do not depend on alpha, and their
-    denominators pass zero where weights of both signs cancel. With positive weights an average lies between the values.
+    In the published form alpha is part of the output layer, and the loss L_n of Eq. 11 brings the integral near one.
+    Normalised averages with volumes 1/sum W would fail in the published form: alpha has no effect on them, and their
+    denominators pass zero where weights of both signs cancel. With positive weights an average of particles' values
+    lies between these values.
 
     The positive form is an even function of q, smooth and without slope at r = 0, as the gradient of a reconstructed
     field requires. Its output layer starts small, so W starts near the bell g.
@@ -218,7 +219,7 @@ class KernelNetwork(nn.Module):
     def integral(self, knots: int = KNOTS) -> Tensor:
         """Integral of the kernel over space before normalisation: 1/alpha for a positive kernel.
 
-        The loss of Eq. 11 brings the integral of a signed kernel near one.
+        The loss of Eq. 11 brings the integral of the published form near one.
         """
         return integral(self._unnormalised(knots))
 

@@ -52,7 +52,7 @@ def panels(rows: int, columns: int, size: tuple[float, float], right: float = 0.
            foot: float = 0.0, **sharing) -> tuple[Figure, np.ndarray]:
     """Return a figure and its axes (rows, columns), with fixed margins for labels and titles.
 
-    All lengths are in inches. size: of one panel with its labels. right: room for colour bars, beside each panel or,
+    All lengths are in inches. size: that of a panel with its labels. right: room for colour bars, beside each panel or,
     with `sharey`, beside the last one. below: room for a legend below each panel. foot: room for one below all panels.
     """
     width, height = size[0] * columns, size[1] * rows

@@ -21,10 +21,10 @@ SERIES = {"energy": "kinetic energy", "acceleration_rms": "rms of an acceleratio
 
 
 def averages(run: Frames, frames: np.ndarray, turnover: float, whose: str) -> dict[str, dict[str, float]]:
-    """Return statistics over frames for each name in SERIES.
+    """Return a table of statistics over `frames` for each name in SERIES.
 
-    The keys are `whose` for the mean, "standard error", "trend per turnover", "error of the trend", and "deviation" for
-    the standard deviation in time.
+    The keys of a table are the text `whose`, for the mean, "standard error", "trend per turnover", "error of the
+    trend", and "deviation", for the standard deviation in time.
     """
     blocks, found = Blocks.of(run.times[frames] / turnover, 1.0), {}
     samples = {"energy": np.array([mean_energy(run, frame) for frame in frames]),
@@ -37,9 +37,9 @@ def averages(run: Frames, frames: np.ndarray, turnover: float, whose: str) -> di
 
 
 def invariant_divergence(model: Sequence[Invariants], flow: Invariants) -> float:
-    """Forward KL divergence of the model's joint PDF of Q and R, over all its frames, from that of the flow.
+    """Forward KL divergence between two joint PDFs of Q and R: that of the flow, and that of all frames of the model.
 
-    Each frame is in units of its own <Q_w>.
+    Q and R of each frame are in units of its own <Q_w> and <Q_w>^(3/2).
     """
     true_plane, *planes = (found.normalized(found.scale) for found in (flow, *model))
     bins = InvariantBins.covering(*true_plane)
@@ -47,7 +47,7 @@ def invariant_divergence(model: Sequence[Invariants], flow: Invariants) -> float
 
 
 def section(run: Rollout, span: StationarySpan) -> Section:
-    """Return the section. Averages of the model are over the second half of the time before it broke."""
+    """Return the section. Averages of the model are over the second half of the time before `run.broken`."""
     shown, turnover = Section("forced", "Forced rollout beside the stationary state"), run.turnover
     frames = run.before_broken("model")
     if not len(frames):
@@ -130,8 +130,8 @@ def forced_rollout(series: tuple[np.ndarray, np.ndarray], flow: tuple[float, flo
                    accelerations: tuple[np.ndarray, np.ndarray]) -> Figure:
     """Draw energy over time, mean spectra and acceleration PDFs of the model and of the stationary flow.
 
-    series: time / T and energy of the model. flow: mean and deviation of the energy of the flow. spectra: wavenumbers,
-    and the spectra of flow and model. accelerations: those of flow and model, standardised.
+    series: time / T and energy of the model. flow: mean and standard deviation of the energy of the flow. spectra:
+    wavenumbers, and the spectra of flow and model. cutoff: k_d. accelerations: those of flow and model, standardised.
     """
     figure, ((energy, spectrum, density),) = panels(1, 3, (3.6, 3.1))
     mean, deviation = flow

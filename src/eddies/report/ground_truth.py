@@ -46,9 +46,9 @@ def section(statistics: Table, spectra: Table, reference: Mapping[str, float], p
     """Return the section from the tables `statistics` and `spectra` and the attributes `reference`.
 
     Numbers are those at the release of the tracers, or at the end if there are no tracers. planes: arrays [y, x] of the
-    last stored field at z = pi, "velocity" for u_x and "vorticity" for its magnitude. field_name: the kind of this
-    field, "filtered" or "final". Times of spectra count from the release of the tracers, times of statistics from the
-    start. source: where the flow comes from.
+    last stored field at z = pi; "velocity" is u_x, and "vorticity" the magnitude of the vorticity. field_name: the kind
+    of this field, "filtered" or "final". Times in `spectra` count from the release of the tracers, and times in
+    `statistics` from the start of the simulation. source: where the flow comes from.
     """
     released, times = reference.get("released_at"), statistics["time"]
     row = -1 if released is None else int(np.argmin(np.abs(times - released)))

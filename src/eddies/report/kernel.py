@@ -28,7 +28,7 @@ ERRORS = {  # name of a reconstruction in the files: start of its keys in the re
 
 @styled
 def shapes(kernels: Mapping[str, np.ndarray]) -> Figure:
-    """Draw h^3 W and h^4 dW/dr over r/h, from the columns r_over_h, value_NAME and derivative_NAME of KERNELS."""
+    """Draw h^3 W and h^4 dW/dr over r/h, from the columns r_over_h, value_NAME and derivative_NAME, NAME in KERNELS."""
     figure, axes = panels(1, 2, (4.4, 3.3))
     for axis, kind in zip(axes.flat, ("value", "derivative")):
         axis.axhline(0, color="#cccccc", linewidth=0.8)
@@ -48,8 +48,8 @@ def shapes(kernels: Mapping[str, np.ndarray]) -> Figure:
 def reconstructed_planes(slices: Mapping[str, np.ndarray], errors: Mapping[str, float]) -> Figure:
     """Draw planes [y, x] of u_x and du_x/dx, truth and reconstructions, with one colour scale per row.
 
-    slices: truth_QUANTITY and QUANTITY_NAME for the quantities velocity and gradient and the names in KERNELS. errors:
-    QUANTITY_error_NAME.
+    The keys of `slices` are truth_QUANTITY and QUANTITY_NAME, and those of `errors` are QUANTITY_error_NAME. QUANTITY
+    is velocity or gradient, and NAME is a name in KERNELS.
     """
     names = [name for name in KERNELS if f"velocity_{name}" in slices and name != "wendland"]
     figure, axes = panels(2, 1 + len(names), (2.665, 2.675), right=BAR, sharex=True, sharey=True)

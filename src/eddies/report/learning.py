@@ -87,6 +87,6 @@ def _noisy(axis: Axes, history: Mapping[str, np.ndarray], name: str, colour: str
         axis.plot(place, chosen, color=colour, alpha=0.25, linewidth=0.6)
         width = max(int(SMOOTHED * len(chosen)), 1)
         mean = np.convolve(chosen, np.full(width, 1 / width), mode="valid")
-        # A single step makes no line.
+        # A single step is drawn as a dot, because it makes no line.
         axis.plot(place[width - 1:], mean, color=colour, linewidth=1.4, marker="." if len(chosen) == 1 else None)
     axis.plot([], [], color=colour, label=label)

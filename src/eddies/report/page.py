@@ -55,7 +55,7 @@ class Section:
     """A part of the page, and of metrics.json under `key`.
 
     notices: sentences in coloured boxes. main: keys of the metrics that are shown beside the title. A `folded` section
-    shows its title and main metrics until the reader opens it.
+    shows only its title and main metrics until the reader opens it.
     """
 
     key: str
@@ -122,11 +122,11 @@ def metrics_json(warnings: Sequence[str], sections: Sequence[Section]) -> str:
 
 def write_page(output: Path, run: RunRecord, sections: Sequence[Section], images: Mapping[str, bytes],
                beside: Mapping[Path, str]) -> None:
-    """Write index.html, metrics.json, figures/NAME.png and the files `beside`, texts by path; remove older figures.
+    """Write index.html, metrics.json, figures/NAME.png and the texts `beside`, by path. Remove older figures.
 
-    Raises OSError, or WriteError if a file cannot be written; then no file has changed.
+    Raises OSError or WriteError. If a file cannot be written, no existing file is changed.
     """
-    earlier = (output / "metrics.json").exists()  # without an earlier report all other figures stay
+    earlier = (output / "metrics.json").exists()  # only then are other figures removed
     (output / "figures").mkdir(parents=True, exist_ok=True)
     figures = {output / "figures" / f"{name}.png": image for name, image in images.items()}
     write_files({**figures, output / "index.html": render_page(run, sections, images),

@@ -19,9 +19,9 @@ def section(about: Mapping[str, float | str], errors: Mapping[str, np.ndarray], 
             plane: np.ndarray | None) -> Section:
     """Return the section on a product reconstruction.h5.
 
-    about: its attributes, such as the method. errors: columns over time, with the error at tracks left out.
-    of_fields: columns over time with errors of the fields; empty if the true fields are not known. plane: u_x [y, x] at
-    z = pi in the last frame; None if the velocity is not stored.
+    about: attributes of the product, such as the method. errors: columns over time, with the error at the tracks that a
+    second reconstruction leaves out. of_fields: columns over time with errors of the fields; empty if the true fields
+    are not known. plane: u_x [y, x] at z = pi in the last frame; None if the velocity is not stored.
     """
     both = {**{name: (of_fields["time"], of_fields[name]) for name in of_fields if name in ERRORS},
             **{name: (errors["time"], errors[name]) for name in errors if name in ERRORS}}

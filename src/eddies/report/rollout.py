@@ -80,7 +80,7 @@ def section(run: Rollout, main: bool = True) -> Section:
 
 
 def _add_closure(shown: Section, solves: Mapping[str, np.ndarray]) -> None:
-    """Add numbers on the solves for the resolved velocity. Means exclude the first frame, whose solve starts from 0."""
+    """Add numbers on solves for the resolved velocity. Means exclude the first frame: its solve has no start value."""
     count, failed = solves["solves"][1:].sum(), int(solves["not_converged"].sum())
     shown.metrics += [
         Metric("closure_iterations", "iterations of a solve for the resolved velocity, mean",

@@ -204,10 +204,10 @@ def path_statistics(model: PathStatistics, truth: PathStatistics, turnover: floa
 @styled
 def particle_disorder(distances: Mapping[str, np.ndarray], counts: Mapping[str, Mapping[str, np.ndarray]],
                       turnover: float) -> Figure:
-    """Draw the PDF of nearest-neighbour distances and the variance of counts over time.
+    """Draw the PDF of nearest-neighbour distances, and the variance of particle counts over time.
 
-    distances: for "truth" and "model", probabilities (bins,) of the bins disorder.DISTANCE_EDGES. counts: for both, the
-    columns time and count_variance.
+    distances: by "truth" and "model", probabilities (bins,) between the edges disorder.DISTANCE_EDGES. counts: by the
+    same names, tables with the columns time and count_variance.
     """
     figure, axes = panels(1, 2, (4.0, 3.1))
     edges = disorder.DISTANCE_EDGES
@@ -230,7 +230,7 @@ def invariant_plane(statistics: InvariantStatistics,
                     flows: tuple[ConditionalVelocity, ConditionalVelocity] | None) -> Figure:
     """Draw joint PDFs of (R, Q) and, if `flows` of model and truth are given, the mean (dR/dt, dQ/dt) at each (R, Q).
 
-    An arrow shows the direction of this mean on the page, and its colour the magnitude in the units of the axes.
+    An arrow has the direction of this mean as drawn. Its colour shows the magnitude of the mean in units of the axes.
     """
     names = "true tracers", "model"
     figure, axes = panels(1 if flows is None else 2, 2, (4.3, 3.2), right=BAR + 0.1, sharex=True, sharey=True)
@@ -242,7 +242,7 @@ def invariant_plane(statistics: InvariantStatistics,
     top = np.floor(2 * peak)
     levels = 10.0 ** (np.arange(top, min(2 * single, top - 1.5), -1)[:8][::-1] / 2)
     for axis, density, name in zip(axes[0], densities, names):
-        # Outer cells are not drawn, because they also count all values beyond. Empty cells get a value above 0.
+        # Outer cells are not drawn, because they also count all values beyond them. Empty cells get a value above 0.
         shown = np.maximum(density[1:-1, 1:-1], 1e-3 * levels[0])
         filled = axis.contourf(_centres(bins.third)[1:-1], _centres(bins.second)[1:-1], shown, levels, cmap="YlGnBu",
                                norm=LogNorm(levels[0], levels[-1]), extend="max")
@@ -273,7 +273,7 @@ def invariant_plane(statistics: InvariantStatistics,
 
 
 def _draw_arrows(axis: Axes, flow: ConditionalVelocity, norm: LogNorm | None, third_limit: float, second_limit: float):
-    """Draw arrows of equal length in the cells within the limits, so that the frame cuts no arrow."""
+    """Draw arrows of equal length where |R| < `third_limit` and |Q| < `second_limit`; no arrow leaves the panel."""
     third, second = np.meshgrid(_centres(flow.bins.third), _centres(flow.bins.second))
     inside = (np.abs(third) < third_limit) & (np.abs(second) < second_limit)
     second_rate, third_rate = (rate[inside] for rate in flow.mean(FEWEST))

@@ -46,7 +46,7 @@ def stationary_state(statistics: Mapping[str, np.ndarray], span: StationarySpan)
 def draw_compensated(axis: Axes, spans: Mapping[str | None, tuple[StationarySpan, str]]) -> None:
     """Draw the compensated mean spectrum of each span, and a band for Kolmogorov's constant.
 
-    spans: a span and the colour of its curve, by label; the legend leaves out the label None.
+    spans: by label, a span and the colour of its curve. A curve with the label None is not in the legend.
     """
     for label, (span, colour) in spans.items():
         k_eta, compensated = span.compensated_spectrum()
@@ -76,7 +76,7 @@ def section(statistics: Mapping[str, np.ndarray], span: StationarySpan) -> Secti
 
 
 def columns_of(row: Row) -> dict[str, float | str]:
-    """Return the values of a row by the title of their column, without missing values."""
+    """Return the values of a row by the titles of their columns; missing values are left out."""
     columns = {"this run": row.value, "standard error": row.error, "deviation": row.deviation,
                "literature": row.literature, "source": row.source}
     return {name: value for name, value in columns.items() if value not in (None, "")}

@@ -10,7 +10,7 @@ from eddies.report.page import Metric, Section
 
 NO_CHANGE = 1e-16  # drawn for a change of 0, which a logarithmic axis cannot show
 
-Trials = Mapping[str, Mapping[str, np.ndarray]]  # by integrator: columns (trials,), each step half the previous
+Trials = Mapping[str, Mapping[str, np.ndarray]]  # by integrator: columns (trials,); each trial halves the previous step
 
 
 def section(found: Mapping[str, float | str], trials: Trials) -> Section:
@@ -40,7 +40,7 @@ def section(found: Mapping[str, float | str], trials: Trials) -> Section:
 def convergence(found: Mapping[str, float | str], trials: Trials, size: str) -> Figure:
     """Draw two panels: the change of the final velocities when a step is halved, and the error over the run time.
 
-    size: name of the step, for the axis.
+    size: "time step" or "Courant number", written on the axis.
     """
     figure, ((change, error),) = panels(1, 2, (4.6, 3.1), foot=0.3)
     for name, columns in trials.items():

@@ -64,8 +64,8 @@ def section(found: TracerStatistics, scales: Mapping[str, float], power: float |
 def tracers(found: TracerStatistics, scales: Mapping[str, float]) -> Figure:
     """Draw the ratio of tracer to field energy, the acceleration PDF, the structure function and the pair dispersion.
 
-    scales: attributes `reference` of a ground truth, measured at the release of the tracers. Units are those of
-    Kolmogorov, or of the large eddies if there is no viscosity.
+    scales: attributes of the group `reference` of a ground truth, measured at the release of the tracers. Lags, and
+    times and lengths of pairs, are in Kolmogorov units, or in units of the large eddies if there is no viscosity.
     """
     viscous = scales["viscosity"] > 0
     time_unit, time_name = (scales["kolmogorov_time"], r"t_\eta") if viscous else (scales["eddy_turnover_time"], "T")

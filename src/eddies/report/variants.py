@@ -25,7 +25,7 @@ Row = Mapping[str, Any]
 KEY = "variants"
 COST = "wall_seconds"
 MARKERS = list(zip((MODEL, TRUTH, SECOND, FOURTH, THIRD, DNS, FILTERED), "os^DvPX"))
-# Titles of the table columns that follow the measures, by their key in the rows.
+# Titles of the table columns to the right of the measures, by the key of the number in a row.
 COSTS = {"end": "end of the rollout (T)", "stopped_at": "became unstable at (T)", "wall_seconds": "wall seconds per T",
          "wall_seconds_low": "wall seconds, lower quartile", "wall_seconds_high": "wall seconds, upper quartile",
          "core_seconds": "core seconds per T", "seconds_per_step": "seconds per step", "time_step": "time step",
@@ -71,7 +71,7 @@ class ErrorAgainstTime:
 
     @property
     def summary(self) -> list[str]:
-        """Sentences: in which measures the subject is worth its cost, and the cheapest grid that is as accurate.
+        """Sentences on where the subject is worth its cost, and on the cheapest grid that is at least as accurate.
 
         A variant that became unstable is treated as one without numbers.
         """

@@ -1,7 +1,8 @@
 """The verdict of a report: it marks each main number as good, fair or poor.
 
-The largest good error and the largest fair error are the same for all methods. They are fixed, or multiples of the
-error of a baseline. Where samples of the truth itself have an error, the limits are at least multiples of that error.
+Two limits, the largest good error and the largest fair error, hold for all methods alike. Each is a fixed number or a
+multiple of the error of a baseline. If samples of the truth have an error themselves, each limit is at least a multiple
+of that error.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,7 +23,7 @@ BESIDE_NO_FORCE = BESIDE_GRADIENT = (0.2, 0.5)  # times the error of the baselin
 BESIDE_TEXTBOOK = (0.95, 1.05)  # times the error of the better kernel that needs no training
 ENERGY = (0.03, 0.1)            # relative deviation from the truth
 SPECTRUM = (0.05, 0.2)          # rms of ln(E/E_filtered)
-DIVERGENCE = (0.002, 0.02)      # nats; normal distributions whose deviations differ by 4 % and 14 % have these values
+DIVERGENCE = (0.002, 0.02)      # nats; normal PDFs whose standard deviations differ by 4 % and 14 % have these values
 FLOORS = (2.0, 5.0)             # times the error of samples of the truth itself
 LEAST_BASELINE = 0.1            # velocities are judged if their error without any force is at least this
 KERNEL_WORDS = {GOOD: "better than", FAIR: "about as good as", POOR: "worse than"}

@@ -81,7 +81,7 @@ def check_foreign(flow: Flow, initial: Initial, simulation: Simulation | None, m
 
 
 def check_flow(flow: Flow, initial: Initial, forcing: Forcing | None, model: Model | None) -> Problems:
-    """Yield problems of the sound speed, initial flow and its keys, and wavenumbers that the grid cannot resolve."""
+    """Yield problems of the sound speed, of [initial], and of wavenumbers that the grid cannot resolve."""
     if flow.compressible and flow.sound_speed is None:
         yield "flow.sound_speed", "this key is missing; a compressible fluid needs a number above 0"
     if not flow.compressible and flow.sound_speed is not None:
@@ -159,7 +159,7 @@ def check_sets(tracers: Tracers, variants: Collection[str]) -> Problems:
 
 
 def check_reach(section: str, neighbors: float, tracers: Tracers, skin: float) -> Problems:
-    """Yield a problem if a kernel support or a radius of interaction, with the skin, is half the cube or more."""
+    """Yield a problem if a radius with `neighbors` particles, times 1 + skin, is at least half the edge of the cube."""
     reach = tracers.radius_of(neighbors) * (1 + skin)
     if reach >= math.pi:  # a particle would interact with another one and its periodic image
         yield f"{section}.neighbors", (
@@ -244,7 +244,7 @@ def check_training(training: Training, tracers: Tracers | None, kernel: Kernel |
 
 
 def check_simulation(simulation: Simulation, tracers: Tracers, seen: float) -> Problems:
-    """Yield a problem if the frame interval is no multiple of the step or the tracers' interval, or start is missing.
+    """Yield a problem if the frame interval is no multiple of the step or the tracers' interval, or `start` is missing.
 
     `seen` is the fraction of the ground truth that training has used.
     """
@@ -263,9 +263,10 @@ def check_simulation(simulation: Simulation, tracers: Tracers, seen: float) -> P
 
 
 def check_coarse_grid(eulerian: Eulerian | None, cells: int, flow: Flow, model: Model | None) -> Problems:
-    """Yield a problem if a coarse grid is not used, is finer than the flow, or lacks a sound speed or damping rates.
+    """Yield a problem if [eulerian] is not used, its grid is too fine, or a sound speed or damping rates are missing.
 
-    `cells` is the number of its cells along a side, 0 if the rollout uses no coarse grid.
+    `cells` is the number of cells along a side of this grid, 0 if the rollout uses none. It may exceed that of the flow
+    only with start = "particles".
     """
     if eulerian is None:
         eulerian = Eulerian()

@@ -20,7 +20,7 @@ class Scheme:
     dense: bool = True  # whether it can interpolate between steps; otherwise frames lie at the ends of steps
     angle: float  # largest k_c u' dt at which a velocity resolved up to k_c follows the flow
     decay: float  # largest stable product of relaxation rate and time step
-    iterations: float  # of the solve for the resolved velocity in an evaluation, with about the longest step
+    iterations: float  # typical number in a solve for the resolved velocity, with about the longest step
     nodes: tuple[float, ...] = ()
     weights: tuple[float, ...] = ()
 

@@ -104,7 +104,7 @@ def with_sections(key: str) -> Iterator[str]:
 
 
 def read_document(name_or_path: str, above: Sequence[Path] = ()) -> tuple[Path, Document]:
-    """Return the path of a scene's file, and its document merged over the documents of its bases.
+    """Return the path of a scene's file, and the scene's document: that of its base, if any, changed by this file.
 
     `above` holds the files of the scenes that have this one as a base. Variants of a scene replace those of its base.
     Raises SceneError if there is no such scene, a file is not TOML, or a scene is its own base.
@@ -136,7 +136,7 @@ def read_document(name_or_path: str, above: Sequence[Path] = ()) -> tuple[Path, 
 
 
 def _find(name_or_path: str, beside: Path | None) -> Path:
-    """Return the file of a built-in scene, or of a path from the folder `beside` or else the working directory."""
+    """Return the file of a built-in scene or of a path, sought in `beside`, then in the working directory."""
     names = sorted(path.stem for path in BUILT_IN.glob("*.toml"))
     if name_or_path in names:
         return BUILT_IN / f"{name_or_path}.toml"

@@ -12,7 +12,7 @@ from eddies.scene.terms import DEFAULT_PRESET, GIVES, PRESETS, READS, TERMS, Ter
 from eddies.scene.values import (SceneError, Section, choice, import_paths, number, product_file, read_section,
                                  sections, text, texts)
 
-BUILT_IN_PREFIX = "eddies:"  # a [model] path that begins so names weights of the package
+BUILT_IN_PREFIX = "eddies:"  # a [model] path with this prefix names weights of the package
 WEIGHTS = Path(__file__).parents[1] / "weights"
 
 
@@ -25,8 +25,8 @@ def built_in_weights() -> list[str]:
 class Model(Section):
     """The terms whose sum moves the particles, each with its settings; a preset is a named list of terms.
 
-    When the section is made, the preset gives `terms` and the absent keys of `settings`. Then `preset` becomes None. A
-    program gives the settings of each term as an object or as a dict.
+    When the section is made, the preset gives `terms` and the absent keys of `settings`. Then `preset` becomes None. In
+    Python, the settings of each term are given as an object or as a dict.
     """
 
     preset: str | None = choice(f"name of a predefined list of terms; absent: {DEFAULT_PRESET}, unless terms is given",
@@ -96,10 +96,10 @@ class Model(Section):
 
 
 def replace_terms(table: dict[str, Any], keys: set[str]) -> None:
-    """Keep only the list of terms that the last layer sets in a [model] table, either `preset` or `terms`.
+    """Remove `terms` from a [model] table if the last layer sets only `preset`, or `preset` if it sets only `terms`.
 
-    `keys` are the keys "section.key" and sections that this layer sets. Settings of terms that are no longer listed are
-    removed, unless this layer sets them.
+    Settings of terms that the remaining list does not name are removed too, unless the layer sets them. `keys` are the
+    keys "section.key" and the sections that the layer sets.
     """
     if ("model.preset" in keys) == ("model.terms" in keys):
         return

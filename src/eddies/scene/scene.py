@@ -140,12 +140,12 @@ class Scene(Section):
         return tuple(stage for stage in STAGES if stage in asked)
 
     def inputs(self, stage: str) -> tuple[Stage, ...]:
-        """The stages of the scene whose products a stage reads."""
+        """The stages of the scene whose products the given stage reads."""
         return tuple(STAGES[name] for name in STAGES[stage].depends_on if name in self.stages)
 
     @property
     def needs_model(self) -> bool:
-        """Whether the rollout needs a trained model: to move the particles, or for a coefficient of a coarse grid."""
+        """Whether the rollout needs a trained model: to move the particles, or for the damping of a coarse grid."""
         on_grid = self.eulerian is not None and self.eulerian.form.learned
         return self.simulation is not None and ("model" in self.simulation.needs or on_grid)
 
@@ -353,7 +353,7 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = (), removals
     Modules of the user's classes are looked for in Python's own folders, then beside the file, then in the working
     directory.
 
-    Raises SceneError, with the file (or --set, --unset), the section, the key, the allowed values, and a remedy.
+    Raises SceneError; its text gives the file (or --set, --unset), section, key and allowed values, and a remedy.
     """
     path, document = read_document(str(name_or_path))
     search_in(path.parent)
@@ -375,7 +375,7 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = (), removals
 
 
 def _tables_of_variants(document: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the changed keys of each variant. Raises SceneError if [variant] is not a section of sections."""
+    """Return a table of changed keys for each variant. Raises SceneError if [variant] is not a section of sections."""
     tables = document.get(VARIANT, {})
     if not isinstance(tables, dict) or not all(isinstance(table, dict) for table in tables.values()):
         raise SceneError(f"{VARIANT}: must be sections; write [{VARIANT}.NAME] and the changed keys below", VARIANT)

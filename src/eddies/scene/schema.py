@@ -17,7 +17,7 @@ LIMITS = {"above": "exclusiveMinimum", "at_least": "minimum", "below": "exclusiv
 def json_schema() -> dict[str, Any]:
     """Return the JSON schema (draft 2020-12) of a scene file.
 
-    The schema requires no key, because a base may give it. It accepts any key in the sections of users' own terms.
+    The schema requires no key, because a base may give any of them. It accepts any key in sections of users' own terms.
     """
     schema = _object(Scene)
     schema["properties"] |= {

@@ -204,8 +204,8 @@ SET_KEYS = ("particles_per_side", "count", "placement", "seed", "filtered", "fil
 class Tracers(Section):
     """Particles that follow the filtered flow: the ground truth for learning.
 
-    An absent `filter_width` gets its value when the section is made. `sets` holds the sets that one simulation carries,
-    by NAME of [tracers.NAME]. A set takes the keys that it lacks from [tracers]. If `set` names one of the sets, the
+    An absent `filter_width` gets its value when the section is made. `sets` maps NAME to the set of [tracers.NAME]; one
+    simulation carries all sets. A set takes the keys that it lacks from [tracers]. If `set` names one of the sets, the
     section takes the values of this set, and `sets` becomes empty.
     """
 

@@ -20,10 +20,10 @@ GIVES = ("acceleration", "density", "density_rate", "shift_velocity")
 #: separation x and their relative velocity v.
 INPUTS = ("density", "distance", "speed", "approach")
 BASES = ("corrected", "paper", "unit")
-# The ratio of the largest rate of relaxation to the nominal rate. The noise of a particle enters the estimate from its
-# neighbours with the opposite sign. So the ratio is 3.6 to 4.0, both among random particles and in turbulence. Two
-# fifths of 4.0 are added for other noise: with a ratio of 4.2 a flow at M_t = 0.16 diverged after a turnover, and with
-# 5.5 a flow on 256^3 cells diverged after a few steps.
+# The ratio of the largest rate of relaxation to the nominal rate. The estimate from neighbours repeats the noise of a
+# particle with the opposite sign. The ratio is therefore 3.6 to 4.0, both among random particles and in turbulence. Two
+# fifths of 4.0 are added, because other effects let noise grow too: with a ratio of 4.2 a flow at M_t = 0.16 diverged
+# after a turnover, and with 5.5 a flow on 256^3 cells diverged after a few steps.
 NOISE_AMONG_NEIGHBORS = 5.6
 
 
@@ -61,7 +61,7 @@ class TermSettings(Section):
     gives : its outputs, any of "acceleration", "density" (a contribution to it), "density_rate" and "shift_velocity".
     learns_through_horizons : whether only training through several steps of the simulation fits its parameters.
     viscous : whether it needs the viscosity of the fluid.
-    pair_cost : cost of a pair of neighbours, over that in a plain sum; `eddies check` estimates times with it.
+    pair_cost : ratio of the cost of a pair to its cost in a plain sum; `eddies check` estimates times with it.
     damps_by : name of its parameter with damping rates by wavenumber, which a coarse grid can use; empty without one.
     too_long : text of the error for a step beyond `longest_step`; it may contain {name}, {longest} and {integrator}.
     """
@@ -309,7 +309,7 @@ class FilteredEquations(TermSettings):
                 'the term "{name}" damps, grows instead; lower step to {longest}')
 
     def longest_step(self, units: StepUnits) -> float:
-        """The longest step in which the scheme can follow the relaxation of the noise of single particles."""
+        """The longest step with which the scheme stably relaxes the noise of single particles."""
         if not units.velocity or not self.relaxation:
             return math.inf
         rate = NOISE_AMONG_NEIGHBORS * self.relaxation * 2 * units.velocity / units.filter_width

@@ -45,7 +45,7 @@ class KeyProblem(SceneError):
 
 
 class Section:
-    """Base of the dataclasses of a scene. The constructor checks every value and stores it in the form of its rule.
+    """Base of the dataclasses of a scene. The constructor checks every value and stores what `Rule.accept` returns.
 
     Raises KeyProblem for a value that its declaration does not allow.
 
@@ -210,7 +210,7 @@ def _missing_key(kind: type[Section], field: dataclasses.Field, section: str) ->
 
 
 def write_section(section: Section, name: str = "", all_keys: bool = False) -> list[str]:
-    """Return the lines `key = value  # meaning` of a section and of its own sections.
+    """Return the lines `key = value  # meaning` of a section and of its inner sections.
 
     Absent keys and sections, and sections without keys, are left out. If `all_keys` is true, comments list what is
     absent. An inner section does not repeat lines of the outer section.

@@ -24,7 +24,7 @@ CACHE_LINE = 64
 # such numbers takes twelve times as long as usual, and one of 192 four times as long.
 CROWDED = 512
 
-#: Packed modes (c, pairs, ky, kx), or a tuple: a factor (1, 1, ky, 1) or (1, 1, 1, kx), and the modes to multiply.
+#: Packed modes (fields, pairs, ky, kx), or a tuple of a factor (1, 1, ky, 1) or (1, 1, 1, kx) and such modes.
 Part = np.ndarray | tuple[np.ndarray, np.ndarray]
 
 
@@ -71,7 +71,7 @@ class PlanePlans(NamedTuple):
     `rows` (pairs, y, kx) is transformed along y; all fields use it, one after the other. Its dropped modes stay zero,
     because no plan writes to its input. `planes` holds the complex planes (pairs, y, x) of each field. `rows` and
     `planes` have the form that `PlanePass.copies` takes. `values` (fields, pairs, y, 2 x) are the same planes as real
-    numbers, with the two values of a point side by side. `plans` holds the plans of each field in their order.
+    numbers, with the two values of a point side by side. `plans` lists the plans of each field in order of execution.
     """
 
     rows: Any
@@ -98,7 +98,10 @@ class PlanePass:
         return blocks if even == count else [*blocks, slice(even, count)]
 
     def to_physical(self, packed: Sequence[Part], fields: int, planes: slice) -> PlanePlans:
-        """Transform packed modes of `fields` fields, in parts, to a block of planes; return plans that hold it."""
+        """Transform packed modes to a block of planes, and return the plans whose memory holds the planes.
+
+        `packed` gives the modes of `fields` fields in parts, each of one or more fields.
+        """
         plans = self.plans("BACKWARD", fields, planes)
         parts = (part if isinstance(part, tuple) else (None, part) for part in packed)
         filled = itertools.chain.from_iterable(self.copies.filled(part, factors, plans.rows) for factors, part in parts)
@@ -108,10 +111,10 @@ class PlanePass:
         return plans
 
     def to_modes(self, plans: PlanePlans, blocks: Any, component: int, planes: slice) -> None:
-        """Transform planes of fields, and store twice their modes, not normalised, in `blocks`.
+        """Transform the planes in the memory of `plans`, and store twice their modes, not normalised, in `blocks`.
 
-        The first field is stored as the component with the number `component`, and the others follow. `blocks` has the
-        form that the copies take.
+        The first field becomes the component with the number `component`, and the others follow. `blocks` has the form
+        that `self.copies` takes.
         """
         for number, of_field in enumerate(plans.plans, component):
             for plan in of_field:
@@ -133,7 +136,7 @@ class PlanePass:
         stop, start = K + 1 + -(K + 1) % vector, n - K - (n - K) % vector
         if stop > start:
             stop, start = K + 1, n - K
-        # The padding that keeps rows apart lies where dropped modes are.
+        # The padding of each row (see `_gap`) lies where the dropped modes are.
         width = stop + n - start
         width += _gap(width, self.dtype)
         rows = pyfftw.zeros_aligned((pairs, n, width), self.dtype)
@@ -164,7 +167,7 @@ class PlanePass:
 
 
 def _gap(count: int, dtype: np.dtype) -> int:
-    """Return the padding after each line of `count` numbers. It keeps transforms across lines from crowding a cache."""
+    """Return the padding after a line of `count` numbers. Without it, transforms across lines would crowd a cache."""
     return 0 if count * dtype.itemsize % CROWDED else CACHE_LINE // dtype.itemsize
 
 

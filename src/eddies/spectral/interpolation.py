@@ -38,7 +38,7 @@ class SplineInterpolation:
         self.inverse = (1.0 / (transforms[0] * transforms[1] * transforms[2])).astype(grid.real)
 
     def coefficients(self, spectral: np.ndarray) -> list[np.ndarray]:
-        """Return the spline coefficients of fields with modes (c, kz, ky, kx), in the parts that `at` takes."""
+        """Return the spline coefficients of fields with modes (c, kz, ky, kx), as the three parts of `with_ghosts`."""
         return self.with_ghosts(self.grid.backward(spectral * self.inverse))
 
     def with_ghosts(self, planes: np.ndarray) -> list[np.ndarray]:
@@ -46,13 +46,13 @@ class SplineInterpolation:
         return self._halo.forward(planes)
 
     def at(self, coefficients: Sequence[np.ndarray], positions: np.ndarray) -> np.ndarray:
-        """Return values (n, c) at positions (n, 3); see `around` for the positions and errors."""
+        """Return spline values (n, c) at positions (n, 3). `around` states the allowed positions and the errors."""
         return self.around(positions).at(coefficients)
 
     def around(self, positions: np.ndarray) -> Splines:
-        """Return the splines around positions (n, 3), for several uses at the same points.
+        """Return the B-splines that contribute at positions (n, 3), for several uses at the same points.
 
-        x and y may be anywhere. z, up to whole periods, may be outside the slab by at most the margin. Raises HaloError
+        x and y may be anywhere. z, modulo the period, may be outside the slab by at most the margin. Raises HaloError
         if z is farther outside, and ValueError if a position is not finite.
         """
         try:
@@ -65,7 +65,7 @@ class SplineInterpolation:
                         "lower step, courant or max_step")
 
     def spread(self, values: np.ndarray, splines: Splines) -> np.ndarray:
-        """Return the sum over the points of their values (n, c) times their splines, on planes (c, z_local, y, x).
+        """Return planes (c, z_local, y, x): the sum over all points of `values` (n, c) times the splines of that point.
 
         This is the transpose of `with_ghosts` followed by evaluation at the points.
         """

@@ -54,7 +54,7 @@ class ModeOperators:
         return self._stack([self.divergence(row) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))])
 
     def pressure_of(self, stress: Modes) -> Modes:
-        """Return p (kz, ky, kx) of mean zero with  laplacian p = -d_i d_j tau_ij,  for a symmetric matrix (6, ...).
+        """Return p (kz, ky, kx) of mean zero with  laplacian p = -d_i d_j tau_ij,  for a symmetric matrix tau (6, ...).
 
         div tau + grad p is solenoidal. With tau = u u, p is the kinematic pressure of an incompressible flow u.
         """

@@ -23,7 +23,7 @@ Expansion = Callable[[np.ndarray], Sequence[Part]]
 
 
 class _Batch(NamedTuple):
-    """Transpose of a batch of components. ColumnCopies take its blocks as `columns`, PlaneCopies as `planes`."""
+    """A transpose for a batch of components, and its blocks as ColumnCopies and PlaneCopies take them."""
 
     transpose: Transpose
     columns: Any
@@ -45,7 +45,7 @@ class SpectralGrid(ModeOperators):
     cutoff : largest wavenumber K of each direction, in units of 2 pi / length, at most (cells - 1) // 2. The default,
         the largest integer below cells / 3, makes quadratic products free of aliasing (Orszag 1971).
 
-    Modes beyond the cutoff are neither transformed further nor sent.
+    Modes beyond the cutoff are dropped during the transform and are not sent to other ranks.
     """
 
     def __init__(self, decomposition: SlabDecomposition, precision: str = "float64", cutoff: int | None = None) -> None:
@@ -66,7 +66,7 @@ class SpectralGrid(ModeOperators):
         self.index_squared = sum(axis.astype(np.int64) ** 2 for axis in self.index)
         super().__init__([(unit * axis).astype(self.real) for axis in self.index],
                          (unit**2 * self.index_squared).astype(self.real), np.stack)
-        #: i kx and i ky of all modes in (ky, kx), in storage order, for the `expand` of `blocks`
+        #: i kx and i ky, shaped to broadcast over the packed modes (c, pairs, ky, kx) in `expand` of `blocks`
         self.d_dx = (1j * unit * signed).astype(self.complex)[None, None, None, :]
         self.d_dy = (1j * unit * signed).astype(self.complex)[None, None, :, None]
         #: weight of a stored mode in a sum over all modes: 2, but 1 for kx = 0, where the mode -k is stored, too
@@ -147,7 +147,7 @@ class SpectralGrid(ModeOperators):
             It gets the packed modes of `spectral`, followed by those of the z derivatives of the first `z_derivatives`
             components. It returns the packed modes of the fields, as a list of parts (c_i, pairs, ky, kx). It may
             combine its input and multiply it by `d_dx` and `d_dy`. A part (d_dx, modes) stands for their product, which
-            is formed while the modes are copied. By default the fields are the input of `expand`.
+            is formed while the modes are copied. By default it returns its input.
         """
         for planes, values in self._value_blocks(spectral, fields, expand, z_derivatives):
             yield values[..., ::2] if planes.stop - planes.start == 1 else values
@@ -166,7 +166,7 @@ class SpectralGrid(ModeOperators):
             yield planes, copies.pack(blocks, planes)
 
     def _columns_to_planes(self, spectral: np.ndarray, z_derivatives: int) -> _Batch:
-        """Transform components along z, and z derivatives of the first `z_derivatives`; redistribute all to planes."""
+        """Transform components, and z derivatives of the first `z_derivatives` of them, along z; send all to planes."""
         components, copies = len(spectral), self.column_pass.copies
         batch = self._batch("backward", components + z_derivatives)
         modes = self._described(spectral, self.complex, self.spectral_shape)
@@ -203,7 +203,7 @@ class SpectralGrid(ModeOperators):
         return spectral
 
     def _batch(self, direction: str, components: int) -> _Batch:
-        """Return the memory for sending a batch of components in a direction; one transform at a time can use it."""
+        """Return the buffers for `components` components and one `direction`; one transform at a time can use them."""
         key = (direction, components)
         if key not in self._batches:
             transpose = Transpose(self.decomposition.comm, self.cells, self.modes, components, self.cutoff + 1,
@@ -223,7 +223,7 @@ class SpectralGrid(ModeOperators):
 
 
 def regrid(source: SpectralGrid, target: SpectralGrid, spectral: np.ndarray) -> np.ndarray:
-    """Return the modes on `target`, finer or coarser, of a field (c, kz, ky, kx) on `source`; new modes are 0."""
+    """Return modes on grid `target` of fields with modes (c, kz, ky, kx) on `source`; 0 where `source` has none."""
     K = min(source.cutoff, target.cutoff)
     planes = [np.r_[0 : K + 1, grid.modes - K : grid.modes] for grid in (source, target)]
     sent, received = (np.abs(grid.index[1].ravel()) <= K for grid in (source, target))

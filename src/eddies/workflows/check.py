@@ -24,7 +24,7 @@ TURBULENCE_KEYS = ("velocity_rms", "dissipation_rate", "reynolds_lambda", "turno
 
 
 def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
-    """Log the estimates of a scene and its variants on these ranks, or print them as JSON; all ranks call it.
+    """Log the estimates of a scene and its variants for `comm.size` ranks, or print them as JSON; all ranks call it.
 
     Raises SceneError at the end if a run would be refused.
     """
@@ -46,7 +46,7 @@ def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
 
 
 def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
-    """Return all estimates, with the keys that docs/check.md describes. Unknown ones are None. All ranks call it."""
+    """Return all estimates, with the keys that docs/check.md describes; None if unknown. All ranks call it."""
     expected, tracers, k_max = estimate(scene), scene.tracers, scene.flow.largest_wavenumber
     rollout_of = {name: estimate(each).rollout for name, each in (scene.variant or {scene.name: scene}).items()}
     context = context_here(scene.stages_of_all, scene.directory, comm)
@@ -82,10 +82,11 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
 
 
 def cost(variant: str | None, stage: str, scenes: Sequence[Scene], ranks: int) -> dict[str, Any]:
-    """Cost of a stage for some scenes, a row of `stage_costs`; times in seconds, memory of a rank and disk in bytes.
+    """Return a row of `stage_costs`: the cost of a stage for all of `scenes`.
 
-    `seconds` and `memory` are for `ranks` ranks, `least_seconds` and `least_memory` for the most that the stage can
-    use, `most_ranks`. The stage leaves `disk` and removes `scratch` at its end.
+    `seconds` (wall time) and `memory` (bytes of a rank) hold for `ranks` ranks. `least_seconds` and `least_memory` hold
+    for `most_ranks`, the most ranks that the stage can use. The stage leaves `disk` bytes, and removes `scratch` bytes
+    at its end. Times and `disk` are sums over the scenes.
     """
     most = min(min(most_ranks(each.ground_truth_alone if stage == "dns" else each).values()) for each in scenes)
 

@@ -25,7 +25,7 @@ def run(one: Path, other: Path, comm: Comm) -> None:
 
 
 def diff_lines(one: Path, other: Path) -> list[str]:
-    """Lines of two tables: settings that differ (defaults included), and numbers that differ, with second / first."""
+    """Lines of two tables of differences: settings (defaults included), and numbers with the ratio second / first."""
     runs = one, other
     settings = [dict(dotted(tomllib.loads(load_scene(path / "scene.toml").to_toml()))) for path in runs]
     lines = [*table("setting", settings, runs), ""]
@@ -37,7 +37,7 @@ def diff_lines(one: Path, other: Path) -> list[str]:
 
 
 def table(title: str, columns: list[dict[str, Any]], runs: tuple[Path, Path], ratio: bool = False) -> list[str]:
-    """Lines of a table of the values that differ between two runs, "-" if missing; or one line if nothing differs."""
+    """Lines of a table of the values that differ between two runs ("-" if missing), or one line if none differs."""
     rows = [(title, *map(str, runs), "ratio" if ratio else "")]
     for key in dict.fromkeys([*columns[0], *columns[1]]):
         first, second = (column.get(key) for column in columns)

@@ -141,7 +141,7 @@ def prepare_set(directory: Path, text: str) -> None:
 
 
 def write_tracers(file: File, tracers: TracerRun, name: str, parts: FrameSegments, forcing: Forcing | None) -> None:
-    """Write the frames, fields and spectra of a set of tracers, and the forcing that acts on them; collective."""
+    """Write the frames, fields and spectra of a set of tracers, and any forcing after the release; collective."""
     parts.assemble(file, series_of(name))
     if tracers.flow.fluid.forcing is not None:
         write_attributes(file.create_group("forcing"), asdict(forcing))

@@ -2,10 +2,10 @@
 
 The rule is the same for every method. The steps of an integrator differ by factors of two. Each step is compared with
 half of it: d is the rms difference of the final velocities, and e is the error of the rollout with the half step. The
-whole step is taken to add the error d to e, and independent errors add as squares. The step has converged if
-e^2 + d^2 is below (1.02 e)^2, that is, if d is below a fifth of e, or if d is less than 1e-3 of the velocity. A step
-must also converge on all ground truths in [simulation] confirmed_on. For coarse grids a Courant number takes the place
-of the step. The cheapest converged step is stored.
+whole step is assumed to add an independent error d, so that its error squared is e^2 + d^2. The step has converged if d
+is below a tolerance: a fifth of e, so that e^2 + d^2 < (1.02 e)^2, or 1e-3 of the velocity if larger. A step must
+also converge on all ground truths in [simulation] confirmed_on. For coarse grids a Courant number takes the place of
+the step. The cheapest converged step is stored.
 
 The steps of the first integrator are halved until one has converged. The search with each other integrator starts at
 the shortest step that needs no more evaluations than the best step so far. It doubles the step while the final velocity
@@ -90,7 +90,7 @@ class Trial:
     Parameters
     ----------
     stretch : the part of a ground truth that it covers.
-    seconds : wall time per turnover time, without storing.
+    seconds : wall time per turnover time of the flow; nothing is stored.
     velocity : the final velocity in order of id; None if the rollout failed.
     """
 
@@ -112,7 +112,7 @@ class Trial:
 
     @property
     def tolerance(self) -> float:
-        """The d below which twice the step has converged: e^2 + d^2 = (1.02 e)^2 with this error e, at least 1e-3."""
+        """The distance within which twice this step has converged: sqrt(1.02^2 - 1) times `error`, at least 1e-3."""
         return max(math.sqrt((1 + LARGEST_ERROR_SHARE) ** 2 - 1) * self.error, LEAST_TOLERANCE)
 
 
@@ -180,7 +180,7 @@ def cheapest(ladders: Sequence[Ladder]) -> tuple[Ladder, int] | None:
 
 
 def cheaper(ladder: Ladder, best: Ladder, of_best: int) -> int | None:
-    """The rung of a ladder's longest converged step that is cheaper than the rung `of_best` of `best`, or None."""
+    """The rung of the longest step in `ladder` that converges and is cheaper than rung `of_best` of `best`, or None."""
     most = best.evaluations / best.size(of_best)
     shortest = max((rung for rung in range(HALVINGS) if ladder.evaluations / ladder.size(rung) <= most), default=-1)
     most_seconds = CHEAPER * best[of_best].seconds

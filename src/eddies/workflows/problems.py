@@ -361,7 +361,7 @@ def rollout_steps(settings: Simulation, allowed: float | None, model: Model, uni
 def beyond_truth(settings: Simulation, tracers: Tracers, seen: float) -> Iterator[str]:
     """Yield a warning if a rollout ends after its ground truth. `seen` is the fraction that training uses.
 
-    A flow that is forced throughout gives none: its later frames are compared with the mean of the ground truth.
+    A flow that is forced throughout gives no warning: later frames are compared with the mean of the ground truth.
     """
     left = (1 - (seen if settings.start is None else settings.start)) * tracers.turnovers
     if settings.turnovers > left * (1 + 1e-9) and not tracers.forced:

@@ -17,7 +17,7 @@ Provenance = Mapping[str, Any]
 
 # Columns of a training history with a number for every step. Other columns are NaN in steps that do not compute them.
 COLUMNS_OF_ALL_STEPS = "step", "phase", "seconds", "loss", "learning_rate", "gradient_norm"
-MOST_NAMED = 4  # largest number of places that a warning names
+MOST_NAMED = 4  # largest number of places in a file that a warning names
 
 
 def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
@@ -55,9 +55,9 @@ def not_finite(file: File, kind: str) -> str:
     places = []
     for place, frame, values in stored_numbers(file):
         table, _, column = place.partition("/")
-        # These may be NaN: a training does not compute every number in every step, and trials of a step may fail.
+        # Some numbers may be NaN: a training does not compute each of them in every step, and a trial may fail.
         gaps = kind == "step" or kind == "model" and table == "history" and column not in COLUMNS_OF_ALL_STEPS
-        # In a ground truth, scales without viscosity and the sound speed of an incompressible fluid are infinite.
+        # In a ground truth, some scales of an inviscid fluid and the sound speed of an incompressible one are infinite.
         wrong = np.isnan(values) if kind == "ground_truth" else ~np.isfinite(values) & (not gaps)
         if wrong.any():
             row = "" if not wrong.ndim else f", row {int(np.argwhere(wrong)[0, 0])}"
@@ -75,9 +75,10 @@ def _made(kind: str, origin: Provenance) -> str:
 
 
 def _other(kind: str, origin: Provenance, present: Provenance | None) -> str:
-    """Describe a product of this kind that is not here, and how its settings differ from the one that is here.
+    """Describe the product of this kind from which another product was made, and which is not in the directory.
 
-    `origin` is the provenance of the product that was made from it, `present` that of the one that is here, or None.
+    `origin` is the provenance of that other product. `present` is the provenance of the product of this kind that is in
+    the directory, or None. With `present` the text names the settings that changed.
     """
     if present is None:
         return f"a {MAKER_OF[kind].file} that is not here"

@@ -94,13 +94,13 @@ class NeighbourMethod(Method):
 
 
 class Source:
-    """Reads the particles of each frame, from measured tracks or from a ground truth; all ranks make one.
+    """Reads the particles of each frame, from measured tracks or from a ground truth; all ranks make it together.
 
     Attributes
     ----------
-    times : times of the frames. spacing : mean distance of the particles. most : largest number in a frame.
-    truth : the ground truth with true fields; None for measured tracks.
-    unit : the scene's unit of length, in the unit of the tracks. corner : the tracks' origin in the cube, in that unit.
+    times : times of the frames. spacing : mean distance of the particles.
+    most : largest number of particles in a frame. truth : the ground truth with true fields; None for measured tracks.
+    unit, corner : the scene's unit of length and the place of the tracks' origin in the cube, both in the tracks' unit.
     """
 
     def __init__(self, tracks: Tracks | None, tracers: Tracers, file: File, comm: Comm) -> None:
@@ -130,7 +130,7 @@ class ReconstructionRun:
 
     Parameters
     ----------
-    source : the particles. methods : one method for all particles; with a holdout, a second one for those kept.
+    source : the particles. methods : one for all particles; with a holdout, also one for those not left out.
     solver : solver on the grid of the modes. settings, tracers : sections [reconstruction] and [tracers].
     viscosity, transfer : nu, and the transfer function G of the filter that the particles' velocity has passed.
     """
@@ -214,9 +214,9 @@ class ReconstructionRun:
 
 
 def sorted_rows(comm: Comm, most: int, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Collect the rows of all ranks on rank 0, sorted by track. Empty rows with the track -1 follow, up to `most` rows.
+    """Collect the rows of all ranks on rank 0, sorted by track, and add empty rows with the track -1.
 
-    Other ranks get no rows. Collective.
+    Rank 0 then has `most` rows, other ranks have none. Collective.
     """
     parts = comm.gather(dict(columns))
     if parts is None:
@@ -233,9 +233,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     """Write reconstruction.h5: the quantities of [reconstruction] fields on a grid, and errors over time.
 
     u is the velocity of the tracks, u* = u / G the velocity before their filter (G = 1 without a filter), and P the
-    projection on solenoidal fields. The acceleration along a track is -G P[div(u* u*)] + nu laplacian u + div(u u), and
-    the pressure is G p[u*]. All quantities are in the units of the tracks and contain only the modes that the particles
-    resolve. A stopped reconstruction continues from its newest checkpoint.
+    projection on solenoidal fields. The acceleration along a track is -G P[div(u* u*)] + nu laplacian u + div(u u). The
+    pressure is G p, with the incompressible pressure p of u*. All quantities are in the units of the tracks and contain
+    only the modes that the particles resolve. A stopped reconstruction continues from its newest checkpoint.
     """
     prepare_torch("cpu", comm)
     settings, tracers, directory = scene.reconstruction, scene.tracers, Path(directory)

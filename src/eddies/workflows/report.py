@@ -60,7 +60,7 @@ SIMULATION = "dns_seconds_per_turnover"
 SOURCE_OF_TRACKS = ("{in_file} measured tracks from {file}, on average {mean_count:.0f} in a frame; {complete} are in "
                     "all frames. Fields are reconstructed from them by least squares. The dissipation rate is the "
                     "value of the literature for this velocity and integral scale.")
-MAIN_PAGE = 3  # time of the main page, and of a round of pages, in units of the time of another page
+MAIN_PAGE = 3  # time to make the main page, and time of a round, divided by the time to make another page
 Row = dict[str, Any]
 
 
@@ -88,7 +88,7 @@ class Page:
         return next((metric.value for metric in self.cost if metric.key == SIMULATION), None)
 
     def draw(self, sections: Sequence[Section]) -> None:
-        """Draw the figures of sections and free them. A figure that fails is left out with a warning."""
+        """Draw the figures of sections, then free the figures. A figure that fails is left out with a warning."""
         for figure in (each for section in sections for each in section.illustrations):
             try:
                 self.images[figure.name] = figures.png(figure.image)
@@ -196,7 +196,7 @@ def sections_of(directory: Path, alone: Comm) -> list[Section]:
 
 def _make(stored: Run, comm: Comm, alone: Comm, stop: StopRequest,
           draw: bool = True) -> tuple[dict[str, Page], dict[str, Row]]:
-    """Make the pages and the rows of all variants. Return the pages of this rank and the rows of all, by variant.
+    """Make the pages and the rows of all variants. Return the pages of this rank, and all rows, by name of the variant.
 
     All ranks measure each rollout together. The rank that makes the variant's page and row collects the results. The
     pages are made in rounds. Raises Stopped, after a variant's rollouts are measured or after a round, when `stop` asks
@@ -238,9 +238,9 @@ def _make(stored: Run, comm: Comm, alone: Comm, stop: StopRequest,
 
 
 def _makers(names: Sequence[str], ranks: int) -> tuple[dict[str, int], dict[str, int]]:
-    """Return two mappings by name of the page: the rank that makes it, and the round in which it is made.
+    """Return two mappings by name of a page: the rank that makes the page, and the round in which this rank makes it.
 
-    The first page is the main page. It takes about as long as three other pages. A round takes as long, too.
+    The first page is the main page. It takes about as long as three other pages, and so does each round.
     """
     makers, rounds, load = {}, {}, [0] * ranks
     for number, name in enumerate(names):
@@ -281,7 +281,7 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
                 page.not_finite[kind] = found
             page.cost += _cost(file, kind)
             if kind == "ground_truth" and "stationary" in file:
-                with contextlib.suppress(ProductError):  # the section about it shows the error
+                with contextlib.suppress(ProductError):  # the section on stationary turbulence shows the error
                     page.stationary = read_stationary_span(file)
             if main or not path.is_symlink():
                 page.sections += _sections_or_notice(kind, page, lambda: readers[kind](file))
@@ -382,7 +382,7 @@ def _rollout_sections(measured: Rollout, page: Page, main: bool) -> list[Section
 
 
 def _cost(file: File, kind: str) -> list[Metric]:
-    """Return the cost of the steps that made a product."""
+    """Return metrics of the cost of the steps of a simulation or rollout; empty for other products."""
     if kind == "ground_truth" and "tracks" in file:
         return []
     if kind == "ground_truth":
@@ -461,8 +461,8 @@ def _write_main(stored: Run, page: Page, rows: Mapping[str, Row], comm: Comm) ->
 
 def _write(page: Page, directory: Path, output: Path, links: Sequence[tuple[str, str]],
            beside: Mapping[Path, str] | None = None, scene: str | None = None) -> None:
-    """Write a page, its numbers and the files `beside` into `output`. `scene` is the text of the scene for a page about
-    all variants; without it, the page shows the scene of the last product."""
+    """Write a page and its numbers into `output`, and the files `beside` (content by path). `scene` is the text of the
+    scene for a page about all variants; without it, the page shows the scene of the last product."""
     rows = [("stage", "ranks", "wall time (s)", "date", "eddies", "commit", "libraries")]
     for kind, origin in page.provenance.items():
         stage = MAKER_OF[kind].name

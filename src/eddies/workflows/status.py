@@ -92,7 +92,7 @@ def status_lines(directory: Path) -> Iterator[str]:
 
 
 def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
-    """Name, size and job of a run, then its stages. The directories of its variants are added to `inner`."""
+    """A line with path, size and job of a run, then one for each stage. Adds directories of variants to `inner`."""
     files = [path for path in directory.rglob("*") if path.is_file() and not path.is_symlink()]
     size, held = in_units(sum(path.stat().st_size for path in files)), find_lock(directory)
     job = "" if held is None else f", {held.holder}{', without a sign of life' if held.stale else ''}"

@@ -42,8 +42,8 @@ log = logging.getLogger("eddies")
 
 RUN = {"dns": dns.run, "train-kernel": train_kernel.run, "reconstruct": reconstruct.run, "train": train.run,
        "find-step": find_step.run, "simulate": simulate.run}
-FEW_STEPS = 4                # steps of a training, and intervals of a rollout
-LEAST_TURNOVERS = 1e-9       # length of a spin-up or ground truth with as few steps as possible
+FEW_STEPS = 4                # steps of the kernel training, and frame intervals of the rollout
+LEAST_TURNOVERS = 1e-9       # turnovers of a spin-up or ground truth with as few steps as possible
 
 
 class StepTimes(StopRequest):
@@ -130,7 +130,7 @@ def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
         definition, device = ModelDefinition.of(few), prepare_torch(whole.device, comm)
         rest, number, step = rest_of_training(definition, few.training, whole.training.frames, directory, device, stop)
         return seconds + rest, step, number
-    if stage == "find-step":  # assumes that its short rollouts last one frame interval here
+    if stage == "find-step":  # assumes that in this run its short rollouts last one frame interval
         span = expected.rollout.turnover_time * find_step.TURNOVERS if expected.rollout else 0.0
         return seconds * max(round(span / whole.simulation.frame_interval), 1), 0.0, 0 if expected.rollout else None
     paces = [after - before for before, after in zip(stop.times[first:], stop.times[first + 1:])]
@@ -150,8 +150,8 @@ def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
 
 def rest_of_training(definition: ModelDefinition, few: Training, frames: int, directory: Path, device: torch.device,
                      stop: StopRequest) -> tuple[float, int, float]:
-    """Estimate the work that the `few` settings omit if only one step is taken: the preparation of further frames, and
-    the steps and validations of all phases. The whole training has `frames` frames.
+    """Estimate the work that a run of one step with the settings `few` leaves out: the preparation of further frames,
+    up to `frames` in the whole training, and the steps and validations of all phases.
 
     Returns the wall time of this work, the number of steps, and the mean seconds of a step.
     """

@@ -35,7 +35,7 @@ from eddies.workflows.track_solver import NO_FILTER, best_solver, particles_on, 
 
 log = logging.getLogger("eddies")
 
-LEAST_TRACKS = 8        # least number of tracks in all frames that a model needs
+LEAST_TRACKS = 8        # least number of tracks that a model needs; each must be in all frames
 INTEGRAL_SCALE = 0.2    # integral scale divided by the edge of the box: a guess, for estimates before the run
 ROUNDS = 20             # iterations for the dissipation rate; each reduces the error to a third
 
@@ -191,7 +191,7 @@ class FrameFlow:
     Parameters
     ----------
     resolved : the result of least squares. columns : this rank's rows of the frame.
-    tracers : says whether the particles follow the filtered velocity, and its filter.
+    tracers : tells whether the particles follow the filtered velocity, and gives the filter width.
     """
 
     def __init__(self, resolved: ResolvedFlow, columns: Mapping[str, np.ndarray], tracers: Tracers) -> None:

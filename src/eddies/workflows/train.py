@@ -56,7 +56,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                      sum(p.numel() for p in model.parameters()), each.learned, each.last - each.learned,
                      each.truth.times[each.last], each.truth.times[-1])
         own = next((each.model for each in data if each.truth is truth), None)
-        # If the model is trained on other ground truths only, it has seen no part of the run's own.
+        # If the model is trained only on other ground truths, it has seen no part of this run's ground truth.
         last = last_seen(settings.window if own is not None else 0.0, len(truth.times))
         guard = Guard(comm, directory / STAGES["train"].checkpoints, stage_fingerprint(scene, "train"), stop,
                       " of the training")
@@ -102,7 +102,7 @@ class LearningCurves:
         self.comm, self.path, self._drawn, self._failed = comm, path, time.monotonic(), False
 
     def __call__(self, training: Training) -> None:
-        """Draw if the last drawing is old."""
+        """Draw if DRAWING_SECONDS have passed since the last drawing."""
         if time.monotonic() - self._drawn > DRAWING_SECONDS:
             self.draw(training)
 

@@ -40,7 +40,7 @@ log = logging.getLogger("eddies")
 
 # Losses of a step that are stored.
 LOSSES = "loss", "velocity", "gradient", "normalization"
-# Forms of reconstruction, besides averages, whose errors are measured with the learned kernel.
+# Methods of reconstruction ("forms"), besides averages, whose errors are measured with the learned kernel.
 OTHER_FORMS = *DEGREES, "kriging"
 
 
@@ -130,7 +130,7 @@ def training_of(settings: Kernel, support: float, mean_volume: float | None, see
 
 
 def losses_of(training: Training) -> dict[str, np.ndarray]:
-    """Columns `step`, and `LOSS_PHASE` for each loss of each phase."""
+    """A table with the column `step` and, for each LOSS of each PHASE, the column `LOSS_PHASE`."""
     columns = training.columns()
     table = {"step": np.arange(training.phases[0].steps)}
     for number, phase in enumerate(training.phases):
@@ -140,7 +140,7 @@ def losses_of(training: Training) -> dict[str, np.ndarray]:
 
 
 def shapes(kernels: dict[str, SmoothingKernel], support: float) -> dict[str, np.ndarray]:
-    """Columns `r_over_h` and, for each kernel of support h, `value_NAME` W h^3 and `derivative_NAME` dW/dr h^4."""
+    """Columns `r_over_h` and, for each kernel of support h, `value_NAME` = W h^3 and `derivative_NAME` = dW/dr h^4."""
     r = torch.linspace(0, support, 201)
     table = {"r_over_h": (r / support).numpy()}
     for name, kernel in kernels.items():
@@ -150,7 +150,7 @@ def shapes(kernels: dict[str, SmoothingKernel], support: float) -> dict[str, np.
 
 
 def compare(kernels: dict[str, SmoothingKernel], sample: KernelSample) -> dict[str, dict[str, np.ndarray]]:
-    """Two tables for a field: `errors` of each kernel, and `slices`, u_x and du_x/dx at z = pi; collective."""
+    """Two tables: `errors` has errors and integral of each kernel, `slices` u_x and du_x/dx at z = pi. Collective."""
     errors, slices = {}, {}
     slab = sample.decomposition
     slices["truth_velocity"] = _middle_plane(slab, sample.field[:, 0])

@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 
 COST = ("seconds_per_step", "time_step", "wall_seconds", "wall_seconds_low", "wall_seconds_high", "core_seconds",
         "ranks")
-# The search for the step: integrator and step ("etdrk4" and a Courant number on a grid), its wall seconds, and errors
-# of short rollouts with the step, half of it and twice of it.
+# The search for the step: integrator and step ("etdrk4" and a Courant number on a grid), wall seconds of the search,
+# and errors of short rollouts with this step, with half of it and with twice of it.
 SEARCH = ("step_integrator", "step_size", "step_seconds", "step_error", "step_error_half", "step_error_twice")
 BEFORE = ("weights", "training_seconds", "training_steps", *SEARCH)  # cost before the rollout
 THROUGH_KERNEL = ("qr_kl", "qr_kl_floor")  # measured on gradients that the smoothing kernel reconstructs
 # Turnovers after which training, search and rollout together have taken less time than a rival, or "never". The first
-# rival is the direct simulation, the second the cheapest grid whose velocity error is not larger.
+# rival is the direct simulation. The second is the cheapest grid whose velocity error is not larger.
 BREAK_EVEN = ("break_even_simulation", "break_even_grid")
 COLUMNS = ("name", "label", "method", "kind", "on_grid", "status", "stopped_at", "realisations", *MEASURES, "end",
            *COST, *BEFORE, *BREAK_EVEN, *(f"{measure}_spread" for measure in MEASURES), "settings")
@@ -47,10 +47,10 @@ _kernel_of = partial(stage_fingerprint, stage="train-kernel")
 
 def row(scene: Scene, name: str, runs: Sequence[RolloutRun], realised: Sequence[Mapping[str, Any]],
         alone: Comm) -> dict[str, Any]:
-    """Return the row of a variant, or of a scene without variants, by COLUMNS; a missing number is None.
+    """Return the row of a variant, or of a scene without variants, with the keys COLUMNS; a missing number is None.
 
-    realised: `numbers` of the rollouts in `runs`, or nothing if one of them is missing. Times are in turnovers T,
-    and `wall_seconds` and `core_seconds` are per turnover.
+    realised: `numbers` of each rollout in `runs`; empty if one of them is missing. Times are in turnovers T, and
+    `wall_seconds` and `core_seconds` are per turnover.
     """
     variant = scene.variant.get(name, scene)
     found: dict[str, Any] = dict.fromkeys(COLUMNS)
@@ -100,8 +100,8 @@ def combined(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def simulation_seconds(scene: Scene, rows: Sequence[Mapping[str, Any]], of_truth: float | None) -> float | None:
-    """Return the wall seconds per turnover of the direct simulation. A variant on the same grid gives them, because it
-    is timed like the other variants. Without such a variant they are `of_truth`, those of the ground truth."""
+    """Return the wall seconds per turnover of the direct simulation: those of the fastest variant on the same grid,
+    which is timed like the other variants. Without such a variant, return `of_truth`, the time of the ground truth."""
     repeated = [row["wall_seconds"] for row in rows if row["wall_seconds"] is not None
                 and (variant := scene.variant.get(row["name"], scene)).coarse_cells == variant.flow.cells]
     return min(repeated, default=of_truth)
@@ -110,8 +110,9 @@ def simulation_seconds(scene: Scene, rows: Sequence[Mapping[str, Any]], of_truth
 def add_break_even(rows: Sequence[dict[str, Any]], simulation: float | None) -> None:
     """Add the numbers of BREAK_EVEN to the rows of trained methods.
 
-    A grid is a rival if its mean velocity error is not larger, at T/2 or, if no rollout reaches T/2, at the end. The
-    search for its step counts too. `simulation`: wall seconds per turnover of the direct simulation, None if unknown.
+    A grid is a rival if its mean velocity error is at most that of the method, at T/2 or, if no rollout reaches T/2, at
+    the end. The time of a grid includes the search for its step. `simulation`: wall seconds per turnover of the direct
+    simulation, None if unknown.
     """
     known = [row for row in rows if row["status"] == "complete" and row["wall_seconds"] is not None]
     measure = "velocity_error_half" if any(row["velocity_error_half"] is not None for row in known) else (

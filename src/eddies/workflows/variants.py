@@ -113,8 +113,8 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
         making = tuple(stage for stage in stages if stage in MAKING)
         return [Step(scene, making, directory)] if making else []
     whole, seeds = scene.without_variants, scene.realisations or ()
-    # By fingerprint, the directory of each ground truth that a variant may use, relative to the directory of the scene
-    # or of a realisation.
+    # Fingerprint of each ground truth that a variant may use, and its directory relative to that of the scene or of a
+    # realisation.
     truths = ({fingerprint: path.parent for path, fingerprint in set_files(whole).items()}
               or {stage_fingerprint(whole, "dns"): Path()})
     realisations = tuple(directory / f"{REALISATION}{seed}" for seed in seeds)
@@ -130,13 +130,13 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
                                              for seed, path in zip(seeds, realisations))]:
         planned.append((None, own, where, SHARED))
         for name, tracers in own.sets.items():
-            if tracers in used:  # the kernel is beside the ground truth of the set
+            if tracers in used:  # the kernel of the set is made beside its ground truth
                 planned.append((None, replace(own, tracers=tracers), where / name, ("train-kernel",)))
     for name in chosen:
         own = scene.variant[name] if name else whole
         if seeds and own.simulation.finds_step and own.simulation.confirmed_on is None and (
                 (below := truths.get(stage_fingerprint(own, "dns"))) is not None):
-            # A step must converge on all realisations, unless these are of another flow than the variant's.
+            # The time step must converge on all realisations, unless they have another flow than the variant.
             confirmed_on = tuple(str(path / below) for path in realisations)
             own = replace(own, simulation=replace(own.simulation, confirmed_on=confirmed_on))
         trained = ("train",) if not seeds or own.model is not None and own.model.path is None else ()
@@ -155,7 +155,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
             if holder is not None and holder != where:
                 links[stage] = holder
                 if seeds and stage == "train" and stage in possible and stage in stages:
-                    working.append(stage)  # it finds the link; rollouts on realisations take their weights from here
+                    working.append(stage)  # this step makes the link from which rollouts take their weights
             elif stage in possible and holder is None:
                 made[key] = where
                 if stage == "dns":

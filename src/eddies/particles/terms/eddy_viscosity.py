@@ -26,8 +26,8 @@ class EddyViscosity(PairTerm):
 
         Pi = -|a_1| mu + |a_2| mu^2,   mu = x.v / (|x|^2 + 0.1),
 
-    in the units of `ScaledPairs`. The window w and the scaling s are as in PairNetwork, with M_i^-1 for s in the basis
-    "corrected". b_1 is x, or x/|x| in the basis "unit". A positive Pi repels. In the form "two-sided" the part mu^2
+    in the units of `ScaledPairs`. The window w and the scaling s are as in PairNetwork; in the basis "corrected" M_i^-1
+    replaces s. b_1 is x, or x/|x| in the basis "unit". A positive Pi repels. In the form "two-sided" the part mu^2
     also repels receding pairs. The form "bounded" replaces x.v by tanh(x.v), as the public code of the paper does: the
     force of a fast pair has a limit. "monaghan" acts on approaching pairs only (mu < 0), as in SPH. a_1 and a_2 are
     learned.

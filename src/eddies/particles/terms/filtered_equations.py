@@ -12,7 +12,7 @@ from eddies.particles.rates import Rates
 from eddies.particles.terms.term import Coefficient, Term
 from eddies.scene import terms as declared
 
-# Two or more sweeps reduce to an eighth or less all errors whose eigenvalues lie between LEAST / sweeps^2 and 1.
+# Two or more sweeps reduce an error to an eighth or less if its eigenvalue lies between LEAST / sweeps^2 and 1.
 LEAST = 2.0
 
 
@@ -20,9 +20,9 @@ class FilteredEquations(Term):
     """dv/dt = -grad p - div tau + nu laplacian u - C_r (2 u'/d) (v - u),   tau = f (d^2/12) grad u grad u^T
 
     Derivatives of the velocity u and of p come from kriging among the neighbours (eddies.particles.kriging). v - u is
-    the difference between a particle's velocity and the neighbours' estimate, and u' the present rms of a component. f
-    is learned. It is near 1, the value of the gradient model (Leonard 1975; Clark et al. 1979); the force of tau is
-    -f (d^2/12) d_j d_k u_i d_k u_j. C_r, C_d and C_p are the settings `relaxation`, `solenoidal` and `density`.
+    the difference between a particle's velocity and the neighbours' estimate. u' is the present rms of a component of
+    v. f is learned. It is near 1, the value of the gradient model (Leonard 1975; Clark et al. 1979). The force of tau
+    is -f (d^2/12) d_j d_k u_i d_k u_j. C_r, C_d and C_p are the settings `relaxation`, `solenoidal` and `density`.
 
     p, the pressure divided by rho_0, starts from c^2 (rho/rho_0 - 1) with the particles' own density. `sweeps` steps of
     Chebyshev's iteration then reduce the residual

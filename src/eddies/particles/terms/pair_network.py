@@ -41,10 +41,10 @@ def scaled(sums: Tensor, settings: PairSum, context: Context) -> Tensor:
 
 
 def along_separation(sums: Tensor, settings: ForceSum, context: Context) -> Tensor:
-    """Sums sum_j w f b_1 (3, k) with any factor f of the pairs, scaled.
+    """Scaled `sums` sum_j w f b_1 (3, k), where f is any factor of a pair.
 
-    In the basis "corrected" the sums are multiplied by the inverse of M_i = sum_j w x x^T instead: differences between
-    irregular particles then give a derivative.
+    In the basis "corrected" the sums are not scaled but multiplied by the inverse of M_i = sum_j w x x^T. Differences
+    between irregularly placed particles then give a derivative.
     """
     if settings.basis == "corrected":
         return moments.apply_symmetric(context.moments.inverse, sums)
@@ -69,7 +69,7 @@ def compiled_switches(settings: PairSum) -> tuple[float, float]:
 
 def compiled_network(network: nn.Module, settings: NetworkSettings, outputs: int, symmetric: bool, context: Context,
                      sign: bool = False) -> CompiledSum | None:
-    """Sum of a term with a network for the compiled library; None for a network of a user's class.
+    """A term's sum with a network, in the form of the compiled library; None for a network of a user's class.
 
     The network has one or two `outputs`. With `sign` the output is multiplied by the sign of the density difference.
     """
@@ -159,8 +159,8 @@ class DensityFlux(PairTerm):
     """d rho_i/dt = r_rms s sum_j w NN_rho, or, with `sign`, r_rms s sum_j w NN_rho sign(rho_i - rho_j).
 
     r_rms is the rms of the density rate. NN_rho is a separate network, a function of the invariants of a pair; w, s and
-    the invariants are as in PairNetwork. The paper does not state what replaces its directions b_k for the density. The
-    sign is taken from the public code.
+    the invariants are as in PairNetwork. The paper does not state what replaces the directions b_k in the density
+    equation. The sign is taken from the public code.
     """
 
     Settings = declared.DensityFlux

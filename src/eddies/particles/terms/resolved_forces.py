@@ -52,8 +52,8 @@ class Stress(Term):
         tau = (d^2/12) grad u grad u^T                                                form "gradient"
 
     u is the resolved velocity, G the transfer function of the filter and d its width. The first form is exact except
-    for unresolved modes (Stolz and Adams 1999). The second is the leading term of its expansion in d (Leonard 1975;
-    Clark et al. 1979). The pressure of the stress contributes to the density. There is no learned parameter.
+    for unresolved modes (Stolz and Adams 1999). The second is the leading term of the first in powers of d (Leonard
+    1975; Clark et al. 1979). The pressure of the stress contributes to the density. There is no learned parameter.
     """
 
     Settings = declared.Stress
@@ -81,8 +81,8 @@ class Damping(Term):
     """-D(k) u for the modes of the resolved velocity u: a spectral eddy viscosity (Kraichnan 1976).
 
     D is k_c u_c times six learned values at wavenumbers equally spaced up to the highest resolved one, k_c. D is linear
-    between these wavenumbers, with D(0) = 0. u_c is the present rms of a component of the smallest resolved scales, the
-    modes of the unfiltered velocity above k_c/2. The energy transfer to unresolved scales depends on these modes.
+    between these wavenumbers, with D(0) = 0. u_c is the present rms of a velocity component of the smallest resolved
+    scales, the modes of the unfiltered velocity above k_c/2. The energy transfer to unresolved scales depends on them.
     """
 
     Settings = declared.Damping
@@ -108,7 +108,7 @@ class Relaxation(Term):
     """-C (v - u): each particle's velocity v relaxes to the resolved velocity u.
 
     The mean of v - u over the particles is subtracted, so the momentum is conserved. C is a learned factor times
-    2 u_rms/d with the present u_rms of u.
+    2 u_rms/d, where u_rms is the present rms of a component of u.
     """
 
     Settings = declared.Relaxation

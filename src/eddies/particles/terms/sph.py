@@ -102,7 +102,8 @@ class WCSPH(_SPHTerm):
 
     The sum P_i/rho_i^2 + P_j/rho_j^2 gives a poor pressure gradient among random particles. Differences
     (P_j - P_i)/(rho_i rho_j) halve the error at single moments, but they do not conserve energy: the energy grows until
-    the rollout stops. A shift that keeps the particles in order prevents this growth, but then nothing is gained.
+    the rollout stops. A shift that keeps the particles in order prevents this growth, but with it the differences bring
+    no advantage.
     """
 
     Settings = declared.WCSPH
@@ -156,8 +157,8 @@ class TransportVelocity(_SPHTerm):
 
     p_b delta_t is learned in units of rho_0 c h. The term uses its magnitude, since particles gather if it is negative.
     The initial value 1/4 is that of Adami et al., with p_b = c^2 rho_0 and a step of h/(4c); here it is used with any
-    step. Adami et al. use the divergence of the stress v w instead of (w.grad) v, which conserves momentum. Its part
-    v div w, however, gives random particles a larger error of the velocity than a shift without any correction.
+    step. Adami et al. use the divergence of the stress v w instead of (w.grad) v. That form conserves momentum. Its
+    part v div w, however, gives random particles a larger error of the velocity than a shift without any correction.
     """
 
     Settings = declared.TransportVelocity

@@ -17,8 +17,8 @@ class Coefficient:
     """A learned coefficient of a term, for reports.
 
     `name` is its symbol, `learned` the dimensionless parameter or parameters, and `meaning` their effect in words.
-    `value` is `learned` in `unit`, for the flow of the term. Units are in L, T and M (eddies.io.quantities); "1" for a
-    pure number.
+    `value` is `learned` in `unit`, for the flow of the term. A unit is a product of powers of L, T and M
+    (eddies.io.quantities); "1" means a pure number.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Coefficient:
 class Term(nn.Module, TermBase):
     """One term of dv_i/dt or d rho_i/dt: a module with named parameters, made from its settings for a flow.
 
-    A user's term derives from this class, declares on its class of `Settings` what it reads and gives, and computes its
+    A user's term derives from this class, declares in its class `Settings` what it reads and gives, and computes its
     contribution in `forward`, in the units of `context.flow`. All ranks evaluate a term together, also ranks without
     particles. A term is `linear` if the rates at given particles are a linear function of the parameters plus a
     constant. Training then stores the effect of each parameter at a moment instead of computing it at every step.
@@ -64,8 +64,8 @@ class Term(nn.Module, TermBase):
 class PairTerm(Term, PairSum):
     """A term that is a sum over pairs; see PairSum.
 
-    The sums of several such terms are taken together over the same pairs. If terms give a density that others read,
-    there are two such passes. Rates are computed for the requested particles; in training, for some of the owned ones.
+    One pass over the pairs computes the sums of several such terms; there are two passes if terms give a density that
+    others read. Rates are computed for the requested particles; in training these are some of the owned ones.
     """
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:

@@ -69,7 +69,7 @@ class Estimates:
     frame_intervals : number of frame intervals of the tracers, 0 without tracers.
     steps : number of steps of the direct simulation.
     resolved_shells : largest wavenumber along each axis of the resolved velocity of particles; 0 without tracers.
-    allowed_step : longest step of particles with a resolved velocity, for the expected rms velocity.
+    allowed_step : longest step with which particles follow their resolved velocity, at the expected rms velocity.
     rollout_step : longest step of the rollout.
     rollout : numbers of the rollout; None also if the scene has no rollout, and for a method of the user.
     """

@@ -112,7 +112,7 @@ def rank_problems(limits: Mapping[str, int], ranks: int) -> Iterator[str]:
 
 
 def reach_limit(tracers: Tracers, reach: float, when: str = "") -> dict[str, int]:
-    """The limit, by its name, from the distance `reach` over which particles interact; the name ends with `when`."""
+    """The limit that `reach`, the range of particle interactions, sets: {name: ranks}. The name ends with `when`."""
     return {f"slabs, at least as thick as the particles' reach {reach:.3g}{when}": thick_slabs(tracers.planes, reach)}
 
 

@@ -18,13 +18,13 @@ from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_PAR
 
 # Memory of a process that holds no field, without and with torch; memory of a report with its figures.
 FLOW_PROCESS, TORCH_PROCESS, REPORT_PROCESS = 100e6, 285e6, 280e6
-# Direct simulation: bytes of a cell in float64, and number of work arrays of at least two planes, both by whether the
-# fluid is compressible; bytes of a tracer.
+# Direct simulation of a compressible (True) or incompressible (False) fluid: bytes of a cell in float64, and number of
+# work arrays of at least two planes. Bytes of a tracer.
 CELL_BYTES, BLOCK_ARRAYS, TRACER_BYTES = {True: 320, False: 220}, {True: 64, False: 32}, 300
-# Bytes in the evaluation of a model: of a particle, a point of its grid, a neighbour in the neighbour lists. Bytes in
-# the training of the kernel: of a neighbour of a grid point, a particle in the table of a field.
+# Bytes in the evaluation of a model: per particle, per grid point, and per neighbour in the neighbour lists. Bytes in
+# the training of the kernel: per neighbour of a grid point, and per particle in the table of a field.
 PARTICLE_BYTES, POINT_BYTES, NEIGHBOR_BYTES, GRADIENT_BYTES, TABLE_BYTES = 800, 160, 8, 200, 1100
-# Bytes on disk: of a product without its frames, a report, a row of the statistics without the spectrum.
+# Bytes on disk: of a product without its frames, of a report, and of a row of the statistics without the spectrum.
 PRODUCT_BYTES, REPORT_BYTES, SAMPLE_BYTES = 45_000, 10e6, 200
 
 

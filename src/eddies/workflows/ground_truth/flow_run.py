@@ -97,9 +97,9 @@ class TracerSet:
     Parameters
     ----------
     fluid, state : the flow.
-    settings, seed : the set, and the seed of random places.
+    settings, seed : settings of the set, and the seed of random places.
     saved : the checkpoint, or None to release new particles.
-    suffix : ends the names of the set's series in segments and of its arrays in checkpoints; empty for the only set.
+    suffix : end of the names of the set's series in segments and of its arrays in checkpoints; empty for the only set.
     """
 
     def __init__(self, fluid: Fluid, state: np.ndarray, settings: Tracers, seed: int, saved: Checkpoint | None,
@@ -146,7 +146,7 @@ class TracerSet:
                 "density_mean": MEAN_DENSITY, **measured_scales(self.comm, first, second, end - start)}
 
     def state_dict(self) -> dict[str, Any]:
-        """The state for a checkpoint, besides the frames."""
+        """The state for a checkpoint, without the frames."""
         order = IdOrder(self.comm, self.tracers.columns["id"], self.settings.particles)
         columns = {name: Block(order.apply(self.tracers.columns[name]), order.start, self.settings.particles)
                    for name in ("position", "velocity")}
@@ -172,8 +172,8 @@ class TracerRun:
     flow : its forcing ends at the release unless [tracers] forced is true.
     segments : the files for the frames.
     settings, seed : [tracers], and the seed of random places.
-    whole : function that returns, for a number of frames, those that also store the unfiltered flow. All of these have
-        filtered fields.
+    whole : function that takes the number of frames, and returns those frames that also store the unfiltered flow. All
+        of the returned frames have filtered fields.
     saved : the checkpoint, or None.
     """
 
@@ -219,7 +219,7 @@ class TracerRun:
                 **self.sets[name].scales(self.segments)}
 
     def state_dict(self) -> dict[str, Any]:
-        """The state for a checkpoint, besides the flow and the files of `segments`."""
+        """The state of the tracers for a checkpoint, without the flow and without the files of `segments`."""
         found = {"released": self.released, "released_at": self.released_at, "interval": self.interval,
                  "step": self.step, "first_step": self.first_step, "frames": self.stored}
         for each in self.sets.values():
@@ -285,7 +285,7 @@ def frame_layout(settings: Tracers, compressible: bool, cutoff: int) -> FrameLay
 
 
 def series_of(name: str) -> dict[str, str]:
-    """The names of a set's series in the ground truth of the set, by their names in `frame_layout`."""
+    """A dict from the names of a set's series in `frame_layout` to their names in the ground truth of the set."""
     return {f"{series}{suffix_of(name)}": series for series in ("tracers", "filtered")} | {"unfiltered": "unfiltered"}
 
 

@@ -49,7 +49,7 @@ def last_trained_on(settings: Training, frames: int) -> int:
 
 def trained_frames(settings: Training, frames: int, field_frames: Sequence[int]) -> tuple[list[int], int]:
     """The frames for training, and the last frame for validation. A field loss that compares with the flow needs a
-    filtered field one frame later. Raises SceneError if none remains for training or for validation."""
+    filtered field one frame later. Raises SceneError if no frame remains for training or for validation."""
     learned, last = last_trained_on(settings, frames), last_seen(settings.window, frames)
     fields = set(field_frames)
     usable = [frame for frame in range(1, last) if not settings.wants_fields or frame + 1 in fields]
@@ -95,10 +95,10 @@ def unfiltered_frames(settings: Simulation | None, training: Training | None, ev
 
 
 def whole_cells(cutoff: int) -> int:
-    """Cells along a side, an even number, of the smallest grid that holds all modes up to a wavenumber."""
+    """The smallest even number of cells along a side with which a grid holds all modes up to `cutoff`."""
     return 2 * cutoff + 2
 
 
 def _frame_at(fraction: float | None, seen: float, frames: int) -> int:
-    """The frame at a fraction of the ground truth, at least 1. None means the end of the training window."""
+    """The frame at `fraction` of the ground truth, at least frame 1. None means the end of the training window."""
     return max(last_seen(seen if fraction is None else fraction, frames), 1)

@@ -25,7 +25,7 @@ MARGIN = 4.0      # distance between a volume and its periodic image, in mean pa
 
 @dataclass(frozen=True)
 class MeasuredTracks:
-    """Rows of tracks in the units of a scene: the edge of the box is 2 pi. They are sorted by frame, then by id.
+    """Rows, each a particle in a frame, in the units of a scene (box edge 2 pi). They are sorted by frame, then by id.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class MeasuredTracks:
     starts : first row of each frame, and at the end the number of rows, (frames + 1,).
     columns : id (rows,), position and velocity (rows, 3), and, with [tracks] sound_speed, density / its mean (rows,).
     throughout : whether the track of a row is present in all frames, (rows,).
-    spacing : mean distance of the particles of a frame, in the volume in which they are.
+    spacing : mean particle spacing, the cube root of (volume with particles / mean number of rows of a frame).
     unit : the scene's unit of length, in the file's unit. corner : the file's origin in the cube, in the file's unit.
     about : the attributes of the product that describe the file and the tracks.
     """
@@ -171,9 +171,9 @@ def _at_frames(found: Tracks, settings: Settings) -> Tracks:
 
 
 def _placed(found: Tracks, settings: Settings) -> tuple[Tracks, float, float, np.ndarray]:
-    """Rows in a periodic cube, its edge, the volume with particles, and the place of the file's origin in the cube.
+    """Return tracks in a periodic cube, its edge, the volume with particles, and the file's origin in the cube.
 
-    A volume that is not periodic lies in the middle of a larger cube, `margin` away from its images.
+    A volume that is not periodic lies in the middle of a larger cube, at least `margin` away from its periodic images.
     """
     if settings.volume is None:
         edge = settings.box if settings.box is not None else found.edge

@@ -106,7 +106,7 @@ class GroundTruth:
         return field.reshape(3, -1).T.astype(np.float64)
 
     def block(self, frame: int, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """The columns `names`, by default all, at a frame, of the particles in this rank's block of ids."""
+        """The id and the columns `names` (by default all) at a frame, for the particles in this rank's block of ids."""
         start, stop = id_block(self.decomposition.comm, self.total)
         names = ("position", *self._evolving) if names is None else names
         columns = self._together(lambda: {name: self.trajectory.read(frame, name, start, stop) for name in names})

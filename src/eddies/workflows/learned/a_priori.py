@@ -74,7 +74,7 @@ def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, las
 
 
 def _given_rate_error(truth: GroundTruth, dynamics: ParticleDynamics, index: int) -> float:
-    """Error of the rate of change of the density that terms give, in centred differences on true trajectories."""
+    """Error of the rate of change of the density that terms give, by centred differences along true trajectories."""
     comm, total = truth.decomposition.comm, truth.total
 
     def density(frame: int) -> np.ndarray:

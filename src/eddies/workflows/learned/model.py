@@ -46,7 +46,7 @@ def take_from_first_rank(model: nn.Module, comm: Comm) -> None:
     """Copy parameters and buffers of rank 0 to all ranks, with a warning if they differed; collective.
 
     Raises SceneError on all ranks if names, their order, shapes, types or `requires_grad` differ between ranks, or if a
-    parameter has no shape yet. The order matters because gradients are summed over ranks in it.
+    parameter has no shape yet. The order matters: gradients of ranks are summed in the order of the tensors.
     """
     tensors = [*model.named_parameters(), *model.named_buffers()]
     own = [[name, _form(tensor)] for name, tensor in tensors]

@@ -20,7 +20,7 @@ from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Model, Scene, SceneError, Tracers
 
-# Keys of terms in version 1.0 that later versions lack, with the values to which these are fixed.
+# Keys of terms in version 1.0 that later versions lack, with the fixed values that later versions use.
 FORMER = {"force": True, "kernel": "cubic-spline", "background": 0.25}
 
 

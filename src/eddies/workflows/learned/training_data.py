@@ -86,7 +86,7 @@ class TrainingData:
         if resolution is None and settings.energy_weight > 0:
             resolution = ResolvedVelocity.on_slabs(slab, self.model.flow.scales, drift, self.dtype)
         if resolution is not None:
-            # Gradients are taken with respect to particles only: an extrapolated guess must not affect a solution.
+            # Gradients neglect how a predicted start depends on earlier states, so it must not affect the solution.
             resolution.tolerance_predicted = resolution.tolerance
         starts = evenly(self.learned - self.longest + 1, self.count)
         windows = [self._window(start, resolution) for start in starts]

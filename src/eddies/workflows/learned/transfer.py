@@ -64,8 +64,8 @@ def trained_on(source: ModelSource, path: str) -> tuple[dict[str, Any], dict[str
     """The origin of the weights of a source, and the a-priori errors on the flow of the training.
 
     The origin has `path` and `mach_turbulent` of the run that trained the weights. A source that took its weights from
-    another run stores this origin. If the source was trained only on ground truths of other runs, the origin has their
-    Mach numbers, `truths`, instead of its own, and the errors are None.
+    another run stores this origin. If the source was trained only on ground truths of other runs, the origin has
+    `truths`, their Mach numbers, instead of `mach_turbulent`, and the errors are None.
     """
     origin = source.provenance
     if "source" in origin:

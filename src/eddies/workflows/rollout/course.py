@@ -54,9 +54,9 @@ class Course:
     def run(self) -> dict[str, float | str]:
         """Advance to the last frame, or until the state is faulty.
 
-        Returns attributes of the product: `status`, `time` of the last frame, and number of `steps`. After at least one
-        step also the mean `time_step`, and the `storing_share` of the wall time that storing took. After a timed step
-        also those of `quartiles`.
+        Returns attributes of the product: `status`, `time` of the last frame, and number of `steps`. If a step was
+        taken, they include the mean `time_step`, and `storing_share`, the share of the wall time that storing took. If
+        a step was timed, they include those of `quartiles`.
         """
         complaint: str | None = None
         if not self.times:

@@ -41,8 +41,8 @@ RUNAWAY_ENERGY = 100.0
 class EulerianRun:
     """A fluid on a coarse grid, with or without a closure, that starts at a frame of the truth.
 
-    The state starts from the modes of the unfiltered velocity that the grid holds. These modes are read from the true
-    flow or found from the velocities of the particles. If the equations are for the filtered velocity, the modes are
+    The initial state has those modes of the unfiltered velocity that the grid can hold. They are read from the true
+    flow, or found from the velocities of the particles. If the equations are for the filtered velocity, these modes are
     filtered first. The particles always follow the filtered velocity.
     """
 
@@ -91,7 +91,7 @@ class EulerianRun:
         longest = min(self.step_limit.bound(self.state, self.clock), self.longest_step)
         step = left / math.ceil(left / longest - 1e-9)
         began = time.perf_counter()
-        with np.errstate(over="ignore", invalid="ignore"):  # the condition below reports it
+        with np.errstate(over="ignore", invalid="ignore"):  # the test of the energy below reports it
             if self.fluid.closure is not None:
                 self.fluid.closure.begin_step(self.state[:3])
             self.state = self.stepper(self.state, step)
@@ -148,8 +148,8 @@ class EulerianRun:
         self.tracers = TracerParticles(self.tracers.field, columns, self.state)
 
     def description(self) -> dict[str, float | str]:
-        """Attributes for the product: grid, fluid and closure. After a step also `flow_seconds_per_step`, the median
-        seconds of a step of the flow, without the particles."""
+        """Attributes for the product: grid, fluid and closure. If a step was taken, they include
+        `flow_seconds_per_step`, the median wall seconds of a step of the flow without the particles."""
         grid = self.fluid.grid
         seconds = {"flow_seconds_per_step": float(np.median(self.flow_seconds))} if self.flow_seconds else {}
         key = self.settings.form.constant
@@ -163,8 +163,8 @@ def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float, dire
                damping: str | None) -> Closure | None:
     """The closure of the equations for a velocity that has passed a filter of this width.
 
-    If `filter_width` is 0, the filter is the sharp cut-off of the grid at its highest wavenumber k_c, and the length
-    Delta is pi/k_c. `damping` names the parameter in the directory's model.h5 that a learned closure takes.
+    If `filter_width` is 0, the filter is the sharp cut-off of the grid at its highest wavenumber k_c, and Smagorinsky's
+    length Delta is pi/k_c. `damping` names the parameter in the directory's model.h5 that a learned closure takes.
     """
     def learned() -> Closure:
         _, weights = load_weights(grid.decomposition.comm, directory / STAGES["train"].file, "model")

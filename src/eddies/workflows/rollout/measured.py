@@ -28,8 +28,8 @@ from eddies.workflows.rollout.particle_measures import (GRADIENT, FieldsOfPartic
 log = logging.getLogger("eddies")
 
 Task = tuple[str, str, int]  # quantity ("spectra", "invariants" or "planes"), "model" or "truth", frame
-#: Measures of true tracers. A key is ground truth, kernel (None for spectra), quantity and frame. The rank that made a
-#: measure holds its value; the other ranks hold None.
+#: Measures of true tracers. A key holds the files of ground truth and kernel (None for spectra), the quantity, and the
+#: frame of the ground truth. The rank that made a measure holds its value; the other ranks hold None.
 TruthMeasures = dict[tuple[Path, Path | None, str, int], Any]
 
 
@@ -129,8 +129,8 @@ class MeasuredRollout:
 
     @property
     def exported(self) -> dict[str, dict[str, Any]]:
-        """For "fields" and "particles", the series of "model" and "truth" by name. Fields, and velocity gradients of
-        particles, need a kernel."""
+        """Under "fields" and "particles": a mapping from "model" and "truth" to their series. Without a kernel, there
+        are no fields, and particles have no velocity gradients."""
         fields, runs = self.fields, self.particles
         if fields is None:
             return {"fields": {}, "particles": runs}
@@ -155,10 +155,10 @@ class MeasuredRollout:
                 known: TruthMeasures | None = None) -> None:
         """Measure a share of the frames on each rank and collect everything on rank `root`; all ranks call it.
 
-        page: measure what a page shows, otherwise only what `accuracy` needs. every_frame: for a main page, measure the
-        velocity gradient at all common frames and spectra at several; otherwise both at the last one. known: measures
-        of true tracers from earlier calls; new ones are added. Ranks other than `root` keep only measures in `known`.
-        ProductError on all ranks if one of them cannot read a frame.
+        page: if true, measure what a page shows, else only what `accuracy` needs. every_frame: if true, measure the
+        velocity gradient at all common frames and, for a page, spectra at several; else both at the last one. known:
+        measures of true tracers from earlier calls; new ones are added. Ranks other than `root` keep only measures in
+        `known`. Raises ProductError on all ranks if one of them cannot read a frame.
         """
         if self._solver is None:
             return
@@ -212,7 +212,7 @@ class MeasuredRollout:
         return list(dict.fromkeys(tasks))
 
     def _key(self, task: Task) -> Any:
-        """Return the key of a measure in TruthMeasures. For a measure of the model it is the task itself."""
+        """Return the key of a true measure in TruthMeasures. For the model, return the task, which is no key there."""
         quantity, of, frame = task
         if of == "model":
             return task

@@ -31,7 +31,7 @@ class Method(Protocol):
 
     def advance(self, until: float, number: int) -> str | None:
         """Take one step, the `number`-th, towards the time `until`. The step may pass that time if `frame` can
-        interpolate. Returns on all ranks the fault of the new state, or None."""
+        interpolate. Returns on all ranks a text on the fault of the new state, None for a sound state."""
 
     def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
         """The particles at a time within the last step, in any order, and their acceleration (n, 3)."""
@@ -40,19 +40,19 @@ class Method(Protocol):
         """Text for the progress line, after time and energy."""
 
     def series(self) -> dict[str, dict[str, list[float]]]:
-        """Tables for the product; each column has one value for each call of `frame`."""
+        """Tables for the product: values by table and column. Each column has one value for each call of `frame`."""
 
     def description(self) -> dict[str, float | str]:
         """Settings of the method, for the attributes of the product."""
 
     def state_dict(self) -> dict[str, Any]:
-        """The state after the frames so far, as `CheckpointDirectory.write` takes it. No name begins with "rollout"."""
+        """The present state by name, to be passed to `CheckpointDirectory.write`. No name begins with "rollout"."""
 
     def load_state_dict(self, saved: Checkpoint) -> None:
         """Continue from a checkpoint, made on any number of ranks; exact on the same number of ranks."""
 
 
-#: The classes behind the words of [simulation] method.
+#: The class of each built-in [simulation] method.
 METHODS: dict[str, Callable[..., Method]] = {"learned": ParticleRun, "none": ParticleRun, "eulerian": EulerianRun}
 
 

@@ -18,17 +18,17 @@ from eddies.particles.particle_field import ParticleField
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.resolved_velocity import ResolvedVelocity
 
-MOST_ITERATIONS = 100  # in a solve for a spectrum, see ParticleSpectra
+MOST_ITERATIONS = 100  # largest number in a solve for a spectrum, see ParticleSpectra
 GRADIENT = "velocity_gradient"
 
 
 class FieldsOfParticles:
-    """Fields that a form of reconstruction computes from particles. The results for the last frame are kept.
+    """Fields that a method of reconstruction computes from particles. The results for the last frame are kept.
 
     Parameters
     ----------
-    form : the form of reconstruction. slab : the box on one rank; its planes are those of the grid of the fields. Grid
-        point i is at i L / planes.
+    form : the method of reconstruction. slab : the box on one rank; the grid of the fields has its planes. Grid point i
+        is at i L / planes.
     """
 
     def __init__(self, form: Form, slab: SlabDecomposition) -> None:

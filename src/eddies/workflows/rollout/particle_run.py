@@ -169,7 +169,7 @@ class ParticleRun:
         return tables if self.dynamics.resolution is None else {**tables, "closure": self._solves}
 
     def state_dict(self) -> dict[str, Any]:
-        """The state for a checkpoint, after the frames of one step and before the next step; collective."""
+        """The state for a checkpoint; collective. Call it after the frames of a step and before the next step."""
         return {**particle_state(self.particles, self.integrator), "series": {
             "outside_training": self._shares_outside, "closure": self._solves}}
 

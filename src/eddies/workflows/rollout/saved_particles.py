@@ -1,5 +1,5 @@
 """Particles in checkpoints. On the same number of ranks, each rank reads the rows that it saved, in the same order.
-Therefore sums over particles are equal to the last bit."""
+Therefore a restart does not change the last bit of a sum over particles."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ MEMORY, BUILT_AT = "memory ", "built at"
 
 
 def saved_rows(comm: Comm, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """The state of columns (n, ...) for a checkpoint. The rows of each rank follow those of the rank before. `columns`
-    holds at least `id` and `position`. Collective."""
+    """The state of columns (n, ...) for a checkpoint, with the rows in the order of the ranks. `columns` holds at least
+    `id` and `position`. Collective."""
     rows = np.zeros(comm.size, np.int64)
     rows[comm.rank] = len(columns["id"])
     rows = global_sum(comm, rows)

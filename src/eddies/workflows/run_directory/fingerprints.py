@@ -67,14 +67,14 @@ def stage_provenance(scene: Scene, stage: str) -> dict[str, Any]:
 
 
 def _without(value: Any, section: str, keys: Sequence[str]) -> Any:
-    """The values of a section without some keys "section.key"; any other value is returned unchanged."""
+    """A section without `keys`, which have the form "section.key". A value that is no section is not changed."""
     if not isinstance(value, dict):
         return value
     return {key: each for key, each in value.items() if f"{section}.{key}" not in keys}
 
 
 def _fingerprints(paths: Sequence[Path]) -> list[str | None]:
-    """The stored fingerprints of ground truths; None for a missing one. The files may be too large to digest."""
+    """The fingerprints stored in ground truths; None for a missing file. The files may be too large to digest."""
     if not paths:
         return []
     from eddies.io.provenance import product_fingerprint  # imports h5py and mpi4py

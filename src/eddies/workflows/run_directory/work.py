@@ -56,10 +56,10 @@ class Work:
 
 
 def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Collection[str] = ()) -> Work:
-    """The work that stages of a scene find in a locked run directory; on one rank. `links` are the
-    stages whose products are links to other directories.
+    """The work that stages of a scene find in a locked run directory; one rank calls it. `links` are the stages whose
+    products are links to other directories.
 
-    Raises ProductError if the system refuses to read a product or a checkpoint, which may be sound.
+    Raises ProductError if the system refuses to read a product or a checkpoint, because the file may be sound.
     """
     done, begun, obsolete, lost, changes = set(), set(), set(), [], {}
     seconds = stage_seconds(directory)
@@ -74,7 +74,7 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
         of_sets = {path: product_provenance(directory / path) for path in sets}
         if complete and all(of_sets[path].get("fingerprint") == fingerprint for path, fingerprint in sets.items()):
             done.add(stage.name)
-            # Checkpoints of other settings can still be continued, and those of a direct simulation serve a longer one.
+            # Checkpoints of other settings may still be continued; those of a direct simulation serve a longer one.
             if not of_others and stage.name != "dns":
                 obsolete.add(stage.name)
             continue
@@ -98,7 +98,7 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
         if of_others:
             obsolete.add(stage.name)
             if origin.get("course") in [fingerprint for _, fingerprint in checkpoints]:
-                continue  # it holds the last state of the product, which is already in `lost`
+                continue  # the checkpoint holds the last state of the product, and the product is already in `lost`
             seconds_so_far = seconds.get(stage.name)
             cost = "" if seconds_so_far is None else f", took {duration(seconds_so_far)}"
             lost.append(f"{stage.checkpoints} (step {checkpoints[0][0]}{cost})")
