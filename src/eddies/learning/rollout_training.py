@@ -156,7 +156,7 @@ class RolloutTrainer:
 
     def _errors(self, window: TrainingWindow, frame: int,
                 particles: ParticleSet) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Yield error, true value and start value of the velocity and, if its rate is learned, of the density."""
+        """Yield error, true value and start value of the velocity, then of the density if the model learns its rate."""
         yield particles.velocity - window.velocity[frame], window.velocity[frame], window.particles.velocity
         if self.integrator.dynamics.model.learns_density:
             yield particles.density - window.density[frame], window.density[frame], window.particles.density

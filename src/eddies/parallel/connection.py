@@ -17,7 +17,7 @@ PATIENCE = 5.0  # seconds that a rank waits for the others to reach the same err
 
 
 class NotConnected(UserError):
-    """MPI connects fewer ranks than were started; `first` tells whether the launcher calls this rank 0."""
+    """MPI connects fewer ranks than the launcher started. `first` is true if this rank has number 0 in the launcher."""
 
     def __init__(self, message: str, first: bool) -> None:
         super().__init__(message)

@@ -72,7 +72,7 @@ class ReferenceScales:
                 raise ScaleError(f"reference scale {name} = {value}: must be finite and {allowed}; {remedy}")
 
     def required(self, name: str) -> float:
-        """A scale by name. Raises ValueError if the flow has no density, and so no scale of density or sound."""
+        """A scale by name. Raises ValueError if it is None: a flow without density has no scale of density or sound."""
         value = getattr(self, name)
         if value is None:
             raise ValueError(f"reference scale {name}: a flow without density has none")

@@ -41,10 +41,10 @@ def scaled(sums: Tensor, settings: PairSum, context: Context) -> Tensor:
 
 
 def along_separation(sums: Tensor, settings: ForceSum, context: Context) -> Tensor:
-    """Scaled `sums` sum_j w f b_1 (3, k), where f is any factor of a pair.
+    """Sums (3, k) along the separation, scaled, or corrected for the irregular places of the neighbours.
 
-    In the basis "corrected" the sums are not scaled but multiplied by the inverse of M_i = sum_j w x x^T. Differences
-    between irregularly placed particles then give a derivative.
+    `sums` is sum_j w f b_1 with any factor f of a pair. In the basis "corrected" the result is M_i^-1 sum_j w f x with
+    M_i = sum_j w x x^T. If f is the difference of a field between the two particles, this is the gradient of the field.
     """
     if settings.basis == "corrected":
         return moments.apply_symmetric(context.moments.inverse, sums)

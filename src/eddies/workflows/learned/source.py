@@ -1,4 +1,4 @@
-"""The definition of a model, its stored description, and trained weights of another run. Needs no torch."""
+"""What defines a model in a scene, and the comparison with a trained model of another run. This module needs no torch."""
 
 from __future__ import annotations
 

@@ -138,7 +138,7 @@ class ParticleRun:
         return Moment.of(self.comm, self.total, self.time, self.particles, rates)
 
     def _count_solves(self) -> None:
-        """Record the effort of the solves for the resolved velocity since the last frame."""
+        """Add a row to the table of SOLVES: the solves for the resolved velocity since the last frame."""
         if self.dynamics.resolution is None:
             return
         solves, self.dynamics.resolution.solves = self.dynamics.resolution.solves, []
