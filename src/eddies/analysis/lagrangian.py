@@ -109,8 +109,8 @@ def differences(model: PathStatistics, truth: PathStatistics) -> dict[str, float
 
 
 def _sample(run: Frames, chosen: Sequence[int], column: str) -> np.ndarray:
-    """Vectors (m, n, 3) of a column in m `chosen` frames, of every k-th particle. The smallest k that leaves at most about
-    VALUES numbers is taken."""
+    """Vectors (m, n, 3) of a column in m `chosen` frames, of every k-th particle, with the smallest k that leaves at
+    most about VALUES numbers."""
     every = -(-run.read(chosen[0], column).size * len(chosen) // VALUES)
     return np.stack([run.read(frame, column)[::every] for frame in chosen])
 

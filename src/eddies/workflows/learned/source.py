@@ -1,4 +1,4 @@
-"""What defines a model in a scene, and the comparison with a trained model of another run. This module needs no torch."""
+"""What defines a model in a scene, and the comparison with a trained model of another run. Needs no torch."""
 
 from __future__ import annotations
 
