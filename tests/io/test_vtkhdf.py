@@ -45,13 +45,13 @@ def test_fields_survive(comm, tmp_path, monkeypatch):
     """At any step, in any order; with the planes that close the periodic cube, copied in several parts."""
     monkeypatch.setattr(vtkhdf, "BLOCK_BYTES", 1000)
     with product(comm, tmp_path) as file:
-        vtkhdf.write_images(tmp_path / "new" / "f.vtkhdf", FieldSeries(file, "filtered"), LENGTH, np.zeros(3), {})
+        vtkhdf.write_images(tmp_path / "new" / "f.vtkhdf", FieldSeries(file, "filtered"), LENGTH, np.array([0.5, 0, -1]), {})
     read = VtkFile(tmp_path / "new" / "f.vtkhdf")
     assert read.times == TIMES
     for frame in (2, 0, 1):
         data, arrays = read.step(frame)
         assert data.GetClassName() == "vtkImageData" and data.GetDimensions() == (CELLS + 1,) * 3
-        assert data.GetOrigin() == (0, 0, 0) and data.GetSpacing() == (LENGTH / CELLS,) * 3
+        assert data.GetOrigin() == (0.5, 0, -1) and data.GetSpacing() == (LENGTH / CELLS,) * 3
         assert arrays.keys() == {"velocity", "density"} and arrays["density"].ndim == 1
         for name, components in (("velocity", 3), ("density", 1)):
             values = np.moveaxis(arrays[name].reshape(*[CELLS + 1] * 3, components), -1, 0)

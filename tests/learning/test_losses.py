@@ -58,6 +58,8 @@ def test_divergence_of_known_histograms():
     p = torch.tensor([0.2, 0.5, 0.3], dtype=torch.float64)
     assert float(kullback_leibler(p, p)) == 0
     assert float(kullback_leibler(p, p.flip(0))) == pytest.approx(0.1 * np.log(1.5), rel=1e-4)
+    truth, predicted = (torch.tensor(values, dtype=torch.float64) for values in ([0.8, 0.1, 0.1], [0.4, 0.4, 0.2]))
+    assert float(kullback_leibler(truth, predicted)) == pytest.approx(0.6 * np.log(2) - 0.1 * np.log(2), rel=1e-4)
 
 
 @pytest.mark.mpi(2, 3)

@@ -12,10 +12,12 @@ the first t_eta, and the standard deviations of several runs, and writes docs/re
 """
 
 import json
+import shutil
 import sys
 import tempfile
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -156,8 +158,10 @@ def at_points(field: np.ndarray, edge: float, places: np.ndarray, width: float) 
     return values(modes), np.stack([values(modes * 1j * along) for along in (k, k[:, None], k[:, None, None])], 1)
 
 
-def made(case: Case, run: Path, seed: int, rest: str, stages: Sequence[str] | None = None) -> Path:
-    """Run stages of a scene of the tracks of a case, with the sections `rest`; returns its directory. Collective."""
+@contextmanager
+def made(case: Case, run: Path, seed: int, rest: str, stages: Sequence[str] | None = None) -> Iterator[Path]:
+    """Run stages of a scene of the tracks of a case, with the sections `rest`. Yields the run directory, which is
+    removed at the end. Collective."""
     comm = MPI.COMM_WORLD
     path = Path(comm.bcast(tempfile.mkdtemp() if comm.rank == 0 else None))
     if comm.rank == 0:
@@ -166,7 +170,10 @@ def made(case: Case, run: Path, seed: int, rest: str, stages: Sequence[str] | No
         (path / "scene.toml").write_text(f"[tracks]\n{lines}\n{rest}")
     comm.Barrier()
     eddies.run(path / "scene.toml", stages=stages, output=path / "run", comm=comm)
-    return path / "run"
+    yield path / "run"
+    comm.Barrier()
+    if comm.rank == 0:  # a gigabyte
+        shutil.rmtree(path)
 
 
 def fields_of(case: Case, run: Path, seed: int) -> dict[str, float]:
@@ -174,10 +181,10 @@ def fields_of(case: Case, run: Path, seed: int) -> dict[str, float]:
     comm, found = MPI.COMM_WORLD, None
     with h5py.File(run / case.tracks / "ground_truth.h5") as truth:
         cells = 2 * truth["fields/filtered"].attrs["cells"]
-        directory = made(case, run, seed, f'[reconstruction]\nmethod = "{case.method}"\ncells = {cells}\n'
-                         'fields = ["velocity", "pressure"]\n', ["dns", "reconstruct"])
-        if comm.rank == 0:
-            found = {name: values.mean() for name, values in errors_of(case, directory, truth).items()}
+        rest = f'[reconstruction]\nmethod = "{case.method}"\ncells = {cells}\nfields = ["velocity", "pressure"]\n'
+        with made(case, run, seed, rest, ["dns", "reconstruct"]) as directory:
+            if comm.rank == 0:
+                found = {name: values.mean() for name, values in errors_of(case, directory, truth).items()}
     return comm.bcast(found)
 
 
@@ -187,8 +194,9 @@ def forecasts_of(tracks: str, weights: str, run: Path, seed: int) -> dict[str, d
         times, limit = truth["particles/tracers/position/time"][:2], float(truth["reference"].attrs["kolmogorov_time"])
     step = float(times[1] - times[0])
     rest = FORECAST.format(weights=weights, interval=step * int(limit / step))
-    directory = made(Case(tracks), run, seed, rest + "".join(GRID.format(cells=cells) for cells in (32, 48)))
-    rows = json.loads((directory / "report/variants.json").read_text(encoding="utf-8"))["rows"]
+    rest += "".join(GRID.format(cells=cells) for cells in (32, 48))
+    with made(Case(tracks), run, seed, rest) as directory:
+        rows = json.loads((directory / "report/variants.json").read_text(encoding="utf-8"))["rows"]
     return {row["name"]: {key: row[key] for key in COLUMNS} for row in rows}
 
 
