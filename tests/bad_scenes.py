@@ -146,5 +146,5 @@ INFEASIBLE = [
     ("tracers.turnovers=0.01", "[training] window = 0.5: holds 2 frames; too few remain for training"),
     ("training.window=0.01", "[training] window = 0.01: holds 2 frames; too few remain for training, "
      "because 2 are for validation, and the longest horizon takes 0; raise window or [tracers] turnovers, or lower"),
-    ("training.horizons={steps = 1, frames = [50]}", "because 50 are for validation, and the longest horizon takes 50; raise window or"),
+    ("training.horizons={steps = 1, frames = [50]}", "because 50 are for validation, and the longest horizon takes 50"),
 ]

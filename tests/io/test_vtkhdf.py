@@ -45,7 +45,8 @@ def test_fields_survive(comm, tmp_path, monkeypatch):
     """At any step, in any order; with the planes that close the periodic cube, copied in several parts."""
     monkeypatch.setattr(vtkhdf, "BLOCK_BYTES", 1000)
     with product(comm, tmp_path) as file:
-        vtkhdf.write_images(tmp_path / "new" / "f.vtkhdf", FieldSeries(file, "filtered"), LENGTH, np.array([0.5, 0, -1]), {})
+        vtkhdf.write_images(tmp_path / "new" / "f.vtkhdf", FieldSeries(file, "filtered"), LENGTH,
+                            np.array([0.5, 0, -1]), {})
     read = VtkFile(tmp_path / "new" / "f.vtkhdf")
     assert read.times == TIMES
     for frame in (2, 0, 1):
