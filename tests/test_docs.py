@@ -162,6 +162,14 @@ def test_example_scenes_have_all_stages(folder):
         assert scene.name == name and scene.stages == tuple(stage for stage in STAGES if stage not in left_out)
 
 
+def test_the_scene_with_an_own_pair_force_differs_from_the_published_system_in_this_force(folder, monkeypatch):
+    monkeypatch.syspath_prepend(CHECKOUT / "docs/examples")
+    variants = load_scene("my-force.toml").variant
+    published, own = (variants[name].model.settings for name in ("paper", "mine"))
+    assert [*own] == ["PairForce", *[*published][1:]]
+    assert all(own[name] == settings for name, settings in published.items() if name != "pairs")
+
+
 def test_numbers_of_the_own_flow_follow_its_rules(folder):
     """Those of docs/own-flow.md, which `eddies check` prints."""
     scene = load_scene("my-flow.toml")

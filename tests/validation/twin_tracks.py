@@ -78,7 +78,7 @@ eulerian.start = "particles"
 """
 WEIGHTS = {"hit": {"filtered-16": "eddies:hit-coarse", "filtered-32": "eddies:hit"},
            "hit-256": {"filtered-16": "eddies:hit-256", "filtered-32": "eddies:hit-256"}}
-COLUMNS = "velocity_error_early", "velocity_error_half", "wall_seconds"
+COLUMNS = "velocity_error_early", "velocity_error_half", "velocity_error_end", "end", "wall_seconds"
 
 
 def write(case: Case, truth: h5py.File, path: Path, seed: int) -> str:
@@ -188,7 +188,7 @@ def fields_of(case: Case, run: Path, seed: int) -> dict[str, float]:
     return comm.bcast(found)
 
 
-def forecasts_of(tracks: str, weights: str, run: Path, seed: int) -> dict[str, dict[str, float]]:
+def forecasts_of(tracks: str, weights: str, run: Path, seed: int) -> dict[str, dict[str, float | None]]:
     """Errors and seconds a turnover of the forecasts of a set of tracks, by method; collective."""
     with h5py.File(run / tracks / "ground_truth.h5") as truth:
         times, limit = truth["particles/tracers/position/time"][:2], float(truth["reference"].attrs["kolmogorov_time"])
@@ -200,9 +200,10 @@ def forecasts_of(tracks: str, weights: str, run: Path, seed: int) -> dict[str, d
     return {row["name"]: {key: row[key] for key in COLUMNS} for row in rows}
 
 
-def combined(found: list[dict[str, float]]) -> dict[str, float]:
-    """Means, and standard deviations of several runs."""
+def combined(found: list[dict[str, float | None]]) -> dict[str, float]:
+    """Means, and standard deviations of several runs, of the numbers that all of them have."""
     values = {name: [each[name] for each in found] for name in found[0]}
+    values = {name: each for name, each in values.items() if None not in each}
     spreads = {f"{name}_spread": float(np.std(each, ddof=1)) for name, each in values.items() if len(found) > 1}
     return {name: float(np.mean(each)) for name, each in values.items()} | spreads
 
