@@ -119,6 +119,16 @@ def test_terms_and_weights_that_nothing_trains(warned, tmp_path):
 
 
 @pytest.mark.mpi(1)
+def test_the_pressure_of_filtered_tracks_is_not_found_among_neighbours(comm):
+    def lines(method, filtered="true"):
+        scene = load_scene(TINY, [f"reconstruction.method={method}", f"tracers.filtered={filtered}"],
+                           ["kernel", "model", "training", "simulation"])
+        return [line for line in problems_of(scene, comm)[1] if "the pressure will be useless" in line]
+
+    assert len(lines("kriging")) == 1 and lines("kriging", "false") == lines("memory") == []
+
+
+@pytest.mark.mpi(1)
 def test_a_warning_names_the_variants_that_it_concerns(comm):
     scene = load_scene("tiny", ["variant.paper.simulation.step=0.3", "variant.no-force.simulation.step=0.3",
                                 "simulation.injection=dissipation", "simulation.frame_interval=0.3"])

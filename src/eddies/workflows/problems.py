@@ -22,8 +22,8 @@ from eddies.parallel.reduction import global_min
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import ScaleError
 from eddies.pipeline import STAGES
-from eddies.scene.scene import (BOX_LENGTH, Flow, Forcing, Initial, Model, Scene, SceneError, Simulation, Time, Tracers,
-                                Training)
+from eddies.scene.scene import (BOX_LENGTH, Flow, Forcing, Initial, Model, Reconstruction, Scene, SceneError,
+                                Simulation, Time, Tracers, Training)
 from eddies.scene.terms import StepUnits
 from eddies.workflows.foreseen.numbers import Estimates, Turbulence, estimate
 from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
@@ -259,6 +259,8 @@ def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
         yield from stability(scene.flow, scene.time, expected)
         for each in tracers.all if tracers is not None else ():
             yield from filter_width(each, scene.flow, scene.initial, scene.forcing)
+    if "reconstruct" in stages:
+        yield from unfiltered_quantities(scene.reconstruction, tracers.filtered)
     if "train" in stages and training is not None:
         yield from untrained_terms(model, training)
     if "simulate" in stages:
@@ -336,6 +338,15 @@ def filter_width(tracers: Tracers, flow: Flow, initial: Initial, forcing: Forcin
             yield (f"[tracers] filter_width = {width:.3g}: passes wavenumbers up to {math.pi / width:.2g}, but the "
                    f"energy is at {highest:g}; lower it to {at_most(math.pi / highest)} or less, or raise "
                    "particles_per_side")
+
+
+def unfiltered_quantities(settings: Reconstruction, filtered: bool) -> Iterator[str]:
+    """Yield a warning if quantities of the velocity before the filter are wanted from estimates among neighbours."""
+    wanted = [name for name in ("pressure", "acceleration") if name in settings.fields]
+    if filtered and settings.of_neighbors and wanted:
+        yield (f'[reconstruction] method = "{settings.method}": the {" and ".join(wanted)} will be useless, because '
+               "undoing the filter of the tracks amplifies the errors of estimates from neighbours; set method = "
+               f'"least-squares" or "memory", or remove {" and ".join(wanted)} from fields')
 
 
 def untrained_terms(model: Model, training: Training) -> Iterator[str]:
