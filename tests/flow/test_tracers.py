@@ -41,7 +41,7 @@ def test_a_particle_may_move_through_as_many_planes_as_the_margin(comm):
 
 @pytest.mark.mpi(1, 3)
 def test_release_depends_on_id_and_seed_only(comm):
-    """And each particle of a lattice starts in its cell."""
+    """And each particle of a lattice starts within a quarter of a cell from the centre of its own."""
     slab = SlabDecomposition(comm, LENGTH, 9)
     particles = release(slab, 3, 6**3, "random")
     assert np.array_equal(particles["position"], random_positions(3, 216, 0, 216, LENGTH)[particles["id"]])
@@ -49,7 +49,9 @@ def test_release_depends_on_id_and_seed_only(comm):
     lattice = release(slab, 3, 5**3, "lattice")
     positions = lattice_positions(3, 5, 0, 125, LENGTH)
     assert np.array_equal(lattice["position"], positions[lattice["id"]])
-    assert len(np.unique(np.floor(positions / (LENGTH / 5)), axis=0)) == 125
+    cells = positions / (LENGTH / 5)
+    assert len(np.unique(np.floor(cells), axis=0)) == 125
+    assert 0.2 < np.abs(cells % 1 - 0.5).max() <= 0.25
 
 
 def exact_path(position, attenuation, time, count=200):

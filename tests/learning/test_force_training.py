@@ -1,3 +1,4 @@
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from eddies.learning.training import Phase, Training, TrainingDiverged
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
+from eddies.particles.exchanges import mean_over_ranks, sum_over_ranks
 from eddies.particles.particle_field import grid_points
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.rates import Rates
@@ -199,6 +201,13 @@ def test_the_loss_of_the_power_corrects_the_attenuation_by_noise(comm):
     # A mean velocity does not count.
     windy = frame_of(comm, trainer.model, wind=7.0)
     assert torch.allclose(windy.fluctuation, trainer.frames[0].fluctuation, rtol=0, atol=1e-12)
+    # The power of an acceleration u'/t along the velocity is 3 u'^2/t, here in units of u'^3/d with t = d/u'.
+    velocity = windy.particles.velocity - 7.0
+    velocity -= mean_over_ranks(comm, velocity)
+    speed = math.sqrt(float(sum_over_ranks(comm, velocity.square().sum())) / (3 * PER_SIDE**3))
+    width = trainer.model.flow.scales.filter_width
+    power = float(sum_over_ranks(comm, (windy.fluctuation * velocity * speed / width).sum())) / PER_SIDE**3
+    assert power == pytest.approx(3, rel=1e-9)
 
 
 @pytest.mark.mpi(1)

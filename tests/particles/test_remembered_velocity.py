@@ -52,6 +52,13 @@ def test_a_forecast_is_the_exact_solution(comm):
     assert float(grid.multiplicity.mul((found - exact(grid, 0.5, still)).abs().square().sum(0)).sum()) < 1e-8
 
 
+@pytest.mark.mpi(1)
+def test_without_data_the_variance_of_the_prior_stays_that_of_the_flow(comm):
+    flow = remembered(comm)
+    first = flow.solver.equations.penalty
+    assert torch.allclose(flow._next_penalty(torch.full_like(first, 0.7)), first, rtol=1e-12)
+
+
 @pytest.mark.mpi(1, 2)
 def test_few_particles_tell_more_over_several_frames(comm):
     """30 particles, new ones in each frame, for 90 modes: one frame cannot determine them, ten can."""

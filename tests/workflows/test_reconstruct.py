@@ -43,6 +43,13 @@ def test_quantities_of_a_taylor_green_vortex_are_exact(comm):
                                   grid, tuple(RECONSTRUCTED), unit)
     for name, values in exact_of(*points(target.decomposition), mean, unit, viscosity).items():
         np.testing.assert_allclose(made.on(target)[name], values, atol=1e-12, err_msg=name)
+    # The filter acts on the velocity with k^2 = 2 and on its pressure with k = 2.
+    width = 1.2
+    transfer = grid.filter_transfer(width)
+    filtered = reconstruct.Quantities(transfer * grid.to_modes(torch.from_numpy(field)), mean, transfer, viscosity, grid,
+                                      ("pressure",), unit)
+    exact = exact_of(*points(target.decomposition), mean, unit, viscosity)["pressure"]
+    np.testing.assert_allclose(filtered.on(target)["pressure"], np.exp(-(2 * width) ** 2 / 24) * exact, atol=1e-12)
     slab = grid.decomposition
     position = np.random.default_rng(comm.rank).uniform(0, 2 * np.pi, (20, 3))
     position[:, 2] = slab.spacing * (slab.start + slab.count * position[:, 2] / (2 * np.pi))

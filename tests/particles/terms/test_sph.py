@@ -209,6 +209,13 @@ def test_disordered_particles_spread_out_in_a_fluid_at_rest(comm):
 
 
 @one_rank
+def test_the_first_background_pressure_is_that_of_adami():
+    """c^2 rho_0, for a step of h/(4c); h is half the radius of the kernel."""
+    (found,) = model({"transport-velocity": {}}, FLOW).terms["transport-velocity"].learned_coefficients
+    assert found.value == pytest.approx(C**2 * SCALES.density_mean * FLOW.cutoff / 2 / (4 * C), rel=1e-12)
+
+
+@one_rank
 def test_the_velocity_follows_the_field_along_the_shift(comm):
     """(w.grad) v of a shear wave (sin z, 0, 0), to a sixth among slightly disordered particles. A uniform velocity in
     addition changes nothing."""
