@@ -7,7 +7,9 @@ import re
 
 import pytest
 
+from eddies.scene.integrators import SCHEMES
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
+from eddies.scene.terms import FilteredEquations, StepUnits
 from eddies.workflows.foreseen.storage import memory
 from eddies.workflows.problems import Context, convenient, memory_of_node, problems
 from tests.bad_scenes import INFEASIBLE
@@ -100,6 +102,10 @@ def test_steps_that_are_too_long_for_a_forced_rollout_or_for_a_term(comm, warned
         given = [*changes, f"simulation.integrator={integrator}", f"simulation.step={step}"]
         lines = problems_of(one_model("hit", given), comm)[1]
         assert any("the noise of the particles, which" in line for line in lines) is expected
+    # The limits of docs/local.md, in units of d/u', for C_r = 1.
+    for integrator, limit in (("corrected-verlet", 0.18), ("rk3", 0.22)):
+        units = StepUnits(radius=1.5, filter_width=1.0, sound_speed=None, velocity=1.0, scheme=SCHEMES[integrator])
+        assert FilteredEquations().longest_step(units) == pytest.approx(limit, rel=0.05)
     sound = ["model.preset=wcsph", "training.horizons.steps=5", "model.wcsph.speed=0.8"]
     line, = (line for line in warned(*sound) if "sound" in line)
     scene = load_scene(TINY, sound)

@@ -46,8 +46,8 @@ def test_quantities_of_a_taylor_green_vortex_are_exact(comm):
     # The filter acts on the velocity with k^2 = 2 and on its pressure with k = 2.
     width = 1.2
     transfer = grid.filter_transfer(width)
-    filtered = reconstruct.Quantities(transfer * grid.to_modes(torch.from_numpy(field)), mean, transfer, viscosity, grid,
-                                      ("pressure",), unit)
+    modes = transfer * grid.to_modes(torch.from_numpy(field))
+    filtered = reconstruct.Quantities(modes, mean, transfer, viscosity, grid, ("pressure",), unit)
     exact = exact_of(*points(target.decomposition), mean, unit, viscosity)["pressure"]
     np.testing.assert_allclose(filtered.on(target)["pressure"], np.exp(-(2 * width) ** 2 / 24) * exact, atol=1e-12)
     slab = grid.decomposition
