@@ -40,12 +40,10 @@ def test_particles_that_enter_a_slab_from_both_sides_must_not_meet(comm, strayed
 @pytest.mark.mpi(2)
 def test_particles_that_approach_across_a_face_by_less_than_the_skin_become_neighbours(comm):
     slab, cutoff, skin = SlabDecomposition(comm, LENGTH, 24), 1.0, 0.4
-    direction = 1 if comm.rank == 0 else -1
-    face = slab.upper if comm.rank == 0 else slab.lower
     neighborhood = Neighborhood(slab, cutoff, skin)
-    particles = particles_at(comm, [face - 0.66 * direction])  # 1.32 apart, and then 0.96
+    particles = particles_at(comm, [slab.upper - 1.18 if comm.rank == 0 else slab.lower + 0.02])  # 1.2 apart, then 0.84
     neighborhood.update(particles)
-    particles.position[:, 2] += 0.18 * direction
+    particles.position[:, 2] += 0.18 if comm.rank == 0 else -0.18
     neighborhood.update(particles)
     position = with_ghosts(neighborhood.halo, particles.position, positions=True)
     assert neighborhood.builds == 1 and len(neighborhood.neighbors.pairs(position[:1], position).distance) == 1
