@@ -111,12 +111,8 @@ class Fit:
 
 def _smoothing_of(fits: list[Fit], noise: float) -> float:
     """The mu for which the residuals of the longest tracks have the variance of the noise."""
-    chosen, tracks = [], 0
-    for fit in sorted(fits, key=lambda fit: -len(fit.times)):
-        chosen.append(fit)
-        tracks += fit.tracks
-        if tracks >= TRIED:
-            break
+    longest = sorted(fits, key=lambda fit: -len(fit.times))
+    chosen = longest[:np.searchsorted(np.cumsum([fit.tracks for fit in longest]), TRIED) + 1]
 
     def excess(logarithm: float) -> float:
         squares, freedom = np.sum([fit.residual(10.0**logarithm) for fit in chosen], axis=0)

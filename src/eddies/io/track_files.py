@@ -31,6 +31,7 @@ from eddies.io.new_files import create_export
 from eddies.io.trajectories import ROUNDING, write_h5md_header
 
 AXES = ("x", "y", "z")
+SUFFIXES = {".npz": "npz", **dict.fromkeys((".csv", ".txt", ".dat", ".tsv"), "csv")}
 FILL = -1  # the id of a row without a particle
 MOST_ID = 2**53  # larger ids are not exact in double precision
 MOST_OFF = 2.0  # if displacement and velocity * interval differ by a larger factor, their units are wrong
@@ -73,19 +74,6 @@ class Tracks:
     def starts(self) -> np.ndarray:
         """First row of each frame and, at the end, the number of rows, (frames + 1,)."""
         return np.append(np.searchsorted(self.time, self.times), len(self.time))
-
-    def displacements(self, edge: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Displacements between successive rows of each track; m is the number of such pairs of rows.
-
-        Returns first row of each pair (m,), displacement (m, 3) and time interval (m,). `edge` is the edge of the
-        periodic cube; each displacement then leads to the nearest image. None means that there is no such cube.
-        """
-        order = np.lexsort((self.time, self.track))
-        same = self.track[order[1:]] == self.track[order[:-1]]
-        first, second = order[:-1][same], order[1:][same]
-        moved = self.position[second] - self.position[first]
-        images = 0.0 if edge is None else edge * np.rint(moved / edge)
-        return first, moved - images, self.time[second] - self.time[first]
 
 
 def read_tracks(path: str | Path, layout: str | None = None, group: str | None = None,
@@ -165,10 +153,8 @@ def _layout_of(path: Path) -> str:
     if suffix in (".h5", ".hdf5", ".h5md"):
         with _opened(path) as file:
             return "h5md" if "particles" in file else "lagrangebench"
-    if suffix == ".npz":
-        return "npz"
-    if suffix in (".csv", ".txt", ".dat", ".tsv"):
-        return "csv"
+    if suffix in SUFFIXES:
+        return SUFFIXES[suffix]
     raise ProductError(f"{path}: the suffix does not show the layout; give the format (in Python: layout), one of "
                        f"{', '.join(LAYOUTS)}")
 
@@ -183,11 +169,8 @@ def _read_h5md(path: Path, group: str | None, interval: float | None) -> Tracks:
         times = time[()] if time.shape else float(time.attrs.get("offset", 0.0)) + time[()] * np.arange(frames)
         velocity, density = (holder[f"{name}/value"][()] if f"{name}/value" in holder else None
                              for name in ("velocity", "density"))
-        ids = np.arange(count)
-        if isinstance(holder.get("id"), h5py.Dataset):
-            ids = holder["id"][()]
-        elif "id/value" in holder:
-            ids = holder["id/value"][()]
+        ids = next((holder[name][()] for name in ("id", "id/value") if isinstance(holder.get(name), h5py.Dataset)),
+                   np.arange(count))
         box = holder.get("box", {})
         edges = box["edges/value"][0] if "edges/value" in box else box["edges"][()] if "edges" in box else []
         edges = np.unique(np.diag(edges) if np.ndim(edges) == 2 else edges)
@@ -201,11 +184,8 @@ def _read_npz(path: Path, group: str | None, interval: float | None) -> Tracks:
     if "pos" not in arrays:
         raise ValueError(f"it holds {', '.join(arrays) or 'nothing'}, but no array pos (frames, particles, 3)")
     frames, count = arrays["pos"].shape[:2]
-    if "time" in arrays:
-        times = arrays["time"]
-    elif interval is not None:
-        times = interval * np.arange(frames)
-    else:
+    times = arrays.get("time", None if interval is None else interval * np.arange(frames))
+    if times is None:
         raise ValueError("it holds no array time; give interval, the time between frames")
     return _from_frames(times, np.broadcast_to(np.arange(count), (frames, count)), arrays["pos"], arrays.get("vel"),
                         arrays.get("rho"))
@@ -330,13 +310,16 @@ def check_inside(tracks: Tracks, lower: np.ndarray, upper: np.ndarray, key: str,
 def check_velocities(tracks: Tracks, edge: float | None, path: str | Path) -> None:
     """Raise ProductError if the median speeds from displacements and from velocities differ by the factor MOST_OFF or
     more. A unit or the box is then wrong. `edge` is the edge of the periodic cube, or None."""
-    if tracks.velocity is None:
+    order = np.lexsort((tracks.time, tracks.track))
+    same = tracks.track[order[1:]] == tracks.track[order[:-1]]
+    first, second = order[:-1][same], order[1:][same]  # successive rows of a track
+    if tracks.velocity is None or not len(first):
         return
-    first, moved, interval = tracks.displacements(edge)
-    if not len(first):
-        return
+    moved = tracks.position[second] - tracks.position[first]
+    if edge is not None:
+        moved -= edge * np.rint(moved / edge)
     given = np.linalg.norm(tracks.velocity[first], axis=1)
-    measured = np.linalg.norm(moved, axis=1) / interval
+    measured = np.linalg.norm(moved, axis=1) / (tracks.time[second] - tracks.time[first])
     factor = float(np.median(measured) / max(np.median(given), 1e-300))
     if not 1 / MOST_OFF < factor < MOST_OFF:
         raise ProductError(f"{path}: particles move {factor:.3g} times as far between frames as their velocities say; "

@@ -106,7 +106,7 @@ def _sections_of(settings: Tracks, learned: bool) -> dict[str, Flow | Tracers]:
     speed = float(np.sqrt(np.mean(tracks.columns["velocity"]**2)))
     turnover = INTEGRAL_SCALE * BOX_LENGTH / speed if speed > 0 else math.inf
     width = None if settings.filter_width is None else settings.filter_width / tracks.unit
-    tracers = Tracers(count=count, filtered=settings.filtered, frame_interval=tracks.interval, filter_width=width,
+    tracers = Tracers(count=count, filtered=settings.filtered, frame_interval=float(tracks.times[1]), filter_width=width,
                       turnovers=max(float(tracks.times[-1] / turnover), 1e-6), field_every=settings.field_every)
     viscosity = 0.0 if settings.viscosity is None else settings.viscosity / tracks.unit**2
     cells, sound = max(tracers.cells, tracers.planes, 8), settings.sound_speed
@@ -123,8 +123,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     the value of the literature for the measured velocity and integral scale (`dissipation_constant`).
     """
     tracers, tracks = scene.tracers, TrackFrames(comm, scene.tracks)
-    complete, times = tracks.complete, tracks.times
-    spacing = tracks.spacing
+    complete, times, spacing = tracks.complete, tracks.times, tracks.spacing
     slab = SlabDecomposition(comm, BOX_LENGTH, tracers.with_count(round((BOX_LENGTH / spacing) ** 3)).planes)
     first, second = tracks.shared(0, 1), tracks.shared(1, 0)
     reference = {"filter_width": tracers.filter_width, "spacing": tracers.spacing, "density_mean": 1.0,

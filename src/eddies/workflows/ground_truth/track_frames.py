@@ -48,10 +48,6 @@ class MeasuredTracks:
     about: Mapping[str, Any]
 
     @property
-    def interval(self) -> float:
-        return float((self.times[-1] - self.times[0]) / (len(self.times) - 1))
-
-    @property
     def mean_count(self) -> float:
         """Mean number of rows of a frame."""
         return len(self.throughout) / len(self.times)
