@@ -106,8 +106,9 @@ def _sections_of(settings: Tracks, learned: bool) -> dict[str, Flow | Tracers]:
     speed = float(np.sqrt(np.mean(tracks.columns["velocity"]**2)))
     turnover = INTEGRAL_SCALE * BOX_LENGTH / speed if speed > 0 else math.inf
     width = None if settings.filter_width is None else settings.filter_width / tracks.unit
-    tracers = Tracers(count=count, filtered=settings.filtered, frame_interval=float(tracks.times[1]), filter_width=width,
-                      turnovers=max(float(tracks.times[-1] / turnover), 1e-6), field_every=settings.field_every)
+    tracers = Tracers(count=count, filtered=settings.filtered, frame_interval=float(tracks.times[1]),
+                      filter_width=width, turnovers=max(float(tracks.times[-1] / turnover), 1e-6),
+                      field_every=settings.field_every)
     viscosity = 0.0 if settings.viscosity is None else settings.viscosity / tracks.unit**2
     cells, sound = max(tracers.cells, tracers.planes, 8), settings.sound_speed
     flow = Flow(fluid="incompressible", cells=cells, viscosity=viscosity) if sound is None else Flow(
