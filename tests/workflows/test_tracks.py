@@ -1,5 +1,7 @@
 """Measured tracks in the place of a direct simulation; here they are the tracers of one, so the truth is known."""
 
+import json
+
 import h5py
 import numpy as np
 import pytest
@@ -140,7 +142,8 @@ sound_speed = 15.0
     (SECTION.replace("20.0", "19.0"), ProductError, "outside the box from .* to .19"),
     (SECTION.replace("box = 20.0", ""), SceneError, "box: this key is missing"),
     (SECTION + "sound_speed = 5.0", SceneError, "has no densities"),
-    (SECTION.replace("true", "false") + "[kernel]\nsteps = 1", SceneError, "filtered = false: models need a filtered"),
+    (SECTION.replace("true", "false") + "sound_speed = 5.0\n[kernel]\nsteps = 1", SceneError,
+     "the density of the unfiltered flow is no filtered density"),
     (SECTION + "[forcing]\ninjection_rate = 1", SceneError, "takes the place of this section"),
     ("realisations = [1]\n" + SECTION, SceneError, "the file has one realisation"),
     (SECTION + '[reconstruction]\nmethod = "memory"', SceneError, "viscosity: .* the method memory"),
@@ -218,6 +221,39 @@ def test_short_tracks_of_the_whole_flow_have_filtered_fields(comm, tmp_path, no_
         field, truth = own["fields/filtered/velocity"][0], true["fields/filtered/velocity"][0]
         assert own["reference"].attrs["energy"] == pytest.approx(true["reference"].attrs["energy"], rel=0.15)
     assert relative(field, truth) < 0.1
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_model_learns_from_tracks_of_the_whole_flow(comm, tmp_path, no_figures, quick_spectra):
+    """Particles follow the reconstructed filtered flow from the first tracks on, as the filtered tracers of the same
+    simulation do. Half of the tracks end early."""
+    prepared(comm, tmp_path / "flow", removals=["kernel", "model", "training", "simulation"], overrides=[
+        "flow.cells=16", "tracers.field_cells=16", "tracers.particles_per_side=14", "tracers.whole.filtered=false",
+        "tracers.smooth.filtered=true", "tracers.turnovers=0.4"])
+    if comm.rank == 0:
+        with h5py.File(tmp_path / "flow/whole/ground_truth.h5") as file:
+            viscosity = file["reference"].attrs["viscosity"]
+            times, position, velocity = (file[f"particles/tracers/{name}"][()] for name in (
+                "position/time", "position/value", "velocity/value"))
+        frame, particle = (part.ravel() for part in np.meshgrid(*map(np.arange, position.shape[:2]), indexing="ij"))
+        there = (frame < len(times) // 2) | (particle % 2 == 0)
+        write_tracks(tmp_path / "whole.h5", times[frame[there]], particle[there], position[frame, particle][there],
+                     velocity[frame, particle][there])
+        (tmp_path / "mine.toml").write_text(
+            f'[tracks]\npath = "{tmp_path / "whole.h5"}"\nviscosity = {viscosity}\nfield_every = 2\n'
+            '[model]\npreset = "resolved"\n[training]\nframes = 4\nbatch = 100\nsteps = 4\n'
+            f'[simulation]\nframe_interval = {2 * (times[1] - times[0])}\nturnovers = 0.05\nstep = 0.05\n')
+    comm.Barrier()
+    run(tmp_path / "mine.toml", output=tmp_path / "run", comm=comm)
+    metrics = json.loads((tmp_path / "run/report/metrics.json").read_text())
+    assert metrics["rollout"]["status"] == "complete" and metrics["model"]["acceleration_error"] < 0.5
+    with h5py.File(tmp_path / "run/ground_truth.h5") as own, h5py.File(
+            tmp_path / "flow/smooth/ground_truth.h5") as true:
+        found, exact = (file["particles/tracers/velocity/value"][()] for file in (own, true))
+        assert found.shape == exact.shape and own["tracks"].attrs["complete"] == 14**3 // 2
+        scales = [file["reference"].attrs["acceleration_rms"] for file in (own, true)]
+    assert relative(found[5], exact[5]) < 0.05 and relative(found[6] - found[4], exact[6] - exact[4]) < 0.2
+    assert scales[0] == pytest.approx(scales[1], rel=0.1)
 
 
 @pytest.mark.mpi(1)

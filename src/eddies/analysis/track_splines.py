@@ -1,4 +1,4 @@
-"""Velocities and accelerations along measured tracks, by smoothing splines.
+"""Velocities along measured tracks, by smoothing splines.
 
 Each track is approximated by a cubic spline s(t) with a knot at each time t_i of the track. The spline minimises
 
@@ -32,14 +32,13 @@ class SmoothedTracks:
     Parameters
     ----------
     rows : index of each row in the arguments of `smooth`; tracks with fewer than three rows are left out.
-    position, velocity, acceleration : (rows, 3). Positions are continuous along a track.
+    position, velocity : (rows, 3). Positions are continuous along a track.
     smoothing : mu of the splines.
     """
 
     rows: np.ndarray
     position: np.ndarray
     velocity: np.ndarray
-    acceleration: np.ndarray
     smoothing: float
 
 
@@ -64,7 +63,7 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
     groups = [np.array(rows) for rows in alike.values()]
     if not groups:
         nothing = np.zeros((0, 3))
-        return SmoothedTracks(np.zeros(0, int), nothing, nothing, nothing, NO_NOISE)
+        return SmoothedTracks(np.zeros(0, int), nothing, nothing, NO_NOISE)
     interval = float(np.median(np.concatenate([np.diff(time[rows[0]]) for rows in groups])))
     fits = [Fit(time[rows[0]], _unwrapped(position[rows], edge), interval) for rows in groups]
     smoothing = _smoothing_of(fits, noise) if noise > 0 else NO_NOISE
@@ -102,10 +101,9 @@ class Fit:
         return squares, 3 * self.tracks * (len(self.times) - float(np.trace(influence)))
 
     def derivatives(self, smoothing: float) -> Iterator[np.ndarray]:
-        """Yield position, velocity and acceleration, each (tracks * n, 3), track after track."""
+        """Yield position and velocity, each (tracks * n, 3), track after track."""
         spline = self.spline(smoothing)
-        for order in range(DEGREE):
-            values = spline.derivative(order)(self.times) if order else spline(self.times)
+        for values in (spline(self.times), spline.derivative()(self.times)):
             yield np.moveaxis(values.reshape(len(self.times), self.tracks, 3), 1, 0).reshape(-1, 3)
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 import math
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -164,18 +164,15 @@ def _read_h5md(path: Path, group: str | None, interval: float | None) -> Tracks:
         holder = _chosen(path, file.get("particles", {}), group, "groups of particles")
         element = holder["position"]
         position = element["value"][()]
-        frames, count = position.shape[:2]
         time = element["time"]
-        times = time[()] if time.shape else float(time.attrs.get("offset", 0.0)) + time[()] * np.arange(frames)
+        times = time[()] if time.shape else float(time.attrs.get("offset", 0.0)) + time[()] * np.arange(len(position))
         velocity, density = (holder[f"{name}/value"][()] if f"{name}/value" in holder else None
                              for name in ("velocity", "density"))
-        ids = next((holder[name][()] for name in ("id", "id/value") if isinstance(holder.get(name), h5py.Dataset)),
-                   np.arange(count))
+        ids = next((holder[key][()] for key in ("id", "id/value") if isinstance(holder.get(key), h5py.Dataset)), None)
         box = holder.get("box", {})
         edges = box["edges/value"][0] if "edges/value" in box else box["edges"][()] if "edges" in box else []
         edges = np.unique(np.diag(edges) if np.ndim(edges) == 2 else edges)
-    return _from_frames(times, np.broadcast_to(ids, (frames, count)), position, velocity, density,
-                        float(edges[0]) if len(edges) == 1 else None)
+    return _from_frames(times, position, velocity, density, edges, ids)
 
 
 def _read_npz(path: Path, group: str | None, interval: float | None) -> Tracks:
@@ -183,24 +180,19 @@ def _read_npz(path: Path, group: str | None, interval: float | None) -> Tracks:
         arrays = {name: file[name] for name in file.files}
     if "pos" not in arrays:
         raise ValueError(f"it holds {', '.join(arrays) or 'nothing'}, but no array pos (frames, particles, 3)")
-    frames, count = arrays["pos"].shape[:2]
-    times = arrays.get("time", None if interval is None else interval * np.arange(frames))
+    times = arrays.get("time", None if interval is None else interval * np.arange(len(arrays["pos"])))
     if times is None:
         raise ValueError("it holds no array time; give interval, the time between frames")
-    return _from_frames(times, np.broadcast_to(np.arange(count), (frames, count)), arrays["pos"], arrays.get("vel"),
-                        arrays.get("rho"))
+    return _from_frames(times, arrays["pos"], arrays.get("vel"), arrays.get("rho"))
 
 
 def _read_lagrangebench(path: Path, group: str | None, interval: float | None) -> Tracks:
     metadata = json.loads((path.parent / "metadata.json").read_text(encoding="utf-8"))
     with _opened(path) as file:
         position = _chosen(path, file, group, "trajectories")["position"][()]
-    frames, count = position.shape[:2]
     lower, upper = np.transpose(metadata["bounds"])
-    edges = np.unique(upper - lower)
-    times = float(metadata["dt"]) * int(metadata.get("write_every", 1)) * np.arange(frames)
-    return _from_frames(times, np.broadcast_to(np.arange(count), (frames, count)), position - lower, None, None,
-                        float(edges[0]) if len(edges) == 1 else None)
+    times = float(metadata["dt"]) * int(metadata.get("write_every", 1)) * np.arange(len(position))
+    return _from_frames(times, position - lower, edges=np.unique(upper - lower))
 
 
 def _read_csv(path: Path, group: str | None, interval: float | None) -> Tracks:
@@ -243,13 +235,17 @@ def _chosen(path: Path, holder: Mapping[str, Any], name: str | None, what: str) 
     raise ProductError(f"{path}: group = {name!r}: the file has these {what}: {listed}; give one of them as group")
 
 
-def _from_frames(times: np.ndarray, ids: np.ndarray, position: np.ndarray, velocity: np.ndarray | None,
-                 density: np.ndarray | None = None, edge: float | None = None) -> Tracks:
-    """Tracks from arrays (frames, particles, ...) and `times` (frames,). Entries with an id below 0 are left out."""
+def _from_frames(times: np.ndarray, position: np.ndarray, velocity: np.ndarray | None = None,
+                 density: np.ndarray | None = None, edges: Sequence[float] = (),
+                 ids: np.ndarray | None = None) -> Tracks:
+    """Tracks from arrays (frames, particles, ...) and `times` (frames,). Entries with an id below 0 are left out. `ids`
+    may be the same in all frames, or None: 0, 1, ... The box is a cube if `edges` holds one number."""
     if position.ndim != 3 or position.shape[2] != 3:
         raise ValueError(f"positions have the shape {position.shape}, not (frames, particles, 3)")
-    for name, values, shape in (("times", times, position.shape[:1]), ("ids", ids, position.shape[:2]),
-                                ("velocities", velocity, position.shape), ("densities", density, position.shape[:2])):
+    ids = np.broadcast_to(np.arange(position.shape[1]) if ids is None else ids, position.shape[:2])
+    edge = float(edges[0]) if len(edges) == 1 else None
+    for name, values, shape in (("times", times, position.shape[:1]), ("velocities", velocity, position.shape),
+                                ("densities", density, position.shape[:2])):
         if values is not None and np.shape(values) != shape:
             raise ValueError(f"{name} have the shape {np.shape(values)}, but positions {position.shape}")
     if np.any(np.diff(times) <= 0):

@@ -260,7 +260,7 @@ def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
         for each in tracers.all if tracers is not None else ():
             yield from filter_width(each, scene.flow, scene.initial, scene.forcing)
     if "reconstruct" in stages:
-        yield from unfiltered_quantities(scene.reconstruction, tracers.filtered)
+        yield from unfiltered_quantities(scene.reconstruction, (scene.tracks or tracers).filtered)
     if "train" in stages and training is not None:
         yield from untrained_terms(model, training)
     if "simulate" in stages:

@@ -243,12 +243,13 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                   " of the reconstruction")
     with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as file:
         source, reference = Source(scene.tracks, tracers, file, comm), read_attributes(file, "reference")
-        width = tracers.filter_width if tracers.filtered else NO_FILTER * source.spacing
+        filtered = (scene.tracks or tracers).filtered
+        width = tracers.filter_width if filtered else NO_FILTER * source.spacing
         solver, weight, _ = best_solver(source.particles(0), partial(
             solver_of, source.slab, reference | {"spacing": source.spacing, "filter_width": width}),
             settings.holdout or HELD_OUT)
         grid = solver.grid
-        transfer = grid.filter_transfer(tracers.filter_width) if tracers.filtered else torch.ones_like(grid.shell)
+        transfer = grid.filter_transfer(tracers.filter_width) if filtered else torch.ones_like(grid.shell)
         kernel: SmoothingKernel = CubicSpline(tracers.radius_of(NEIGHBORS))
         if settings.of_neighbors and scene.kernel is not None and source.truth is not None:
             kernel = load_form(comm, directory / STAGES["train-kernel"].file, source.truth.scales).kernel

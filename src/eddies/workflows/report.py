@@ -346,6 +346,7 @@ def _ground_truth_sections(file: File) -> list[Section]:
         found = tracer_statistics(Trajectory(file, "tracers"), spectra, reference["spacing"])
         scene = tomllib.loads(read_provenance(file)["scene"])
         filtered = scene.get("tracks", scene.get("tracers", {})).get("filtered", True)
+        filtered |= "tracks" in file and bool(file["tracks"].attrs.get("traced", False))
         sections.append(tracers.section(found, reference, None if source else power, filtered))
     return sections
 

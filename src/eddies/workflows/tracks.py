@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from eddies.analysis.isotropic_turbulence import dissipation_constant
 from eddies.flow.statistics import component_energies, energy_spectrum, gradient_moments, turbulence_scales
@@ -18,13 +19,15 @@ from eddies.io.fields import FieldWriter
 from eddies.io.hdf5 import create_product, in_files, write_attributes, write_table
 from eddies.io.trajectories import TrajectoryWriter
 from eddies.parallel.communicator import Comm
-from eddies.parallel.migration import id_block
+from eddies.parallel.migration import IdOrder, id_block, migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
+from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.flow_units import measured_scales
-from eddies.particles.particle_set import as_numpy
-from eddies.particles.resolved_velocity import ResolvedFlow
+from eddies.particles.fourier_grid import FourierGrid
+from eddies.particles.particle_set import ParticleSet, as_numpy
+from eddies.particles.remembered_velocity import RememberedVelocity
 from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Flow, Scene, SceneError, Tracers
 from eddies.scene.sections import Eulerian, Initial, Tracks
@@ -37,6 +40,7 @@ log = logging.getLogger("eddies")
 
 LEAST_TRACKS = 8        # least number of tracks that a model needs; each must be in all frames
 INTEGRAL_SCALE = 0.2    # integral scale divided by the edge of the box: a guess, for estimates before the run
+MEMORY = 4.0            # memory of the fields that FilteredTracers follow (RememberedVelocity)
 ROUNDS = 20             # iterations for the dissipation rate; each reduces the error to a third
 
 
@@ -78,9 +82,9 @@ def _unfit(scene: Scene) -> Iterator[str]:
             yield (f'[reconstruction] method = "{wanted.method}": its points need particles on all sides, which a '
                    'volume that is not periodic lacks; set method = "least-squares" or "memory"')
     learned = [f"[{name}]" for name in ("kernel", "model", "simulation") if getattr(scene, name) is not None]
-    if learned and not settings.filtered:
-        yield (f"[tracks] filtered = false: models need a filtered velocity; remove {', '.join(learned)}, or set "
-               "filtered = true if the tracks follow a filtered velocity")
+    if learned and not settings.filtered and settings.sound_speed is not None:
+        yield (f"[tracks] sound_speed = {settings.sound_speed:g}: the density of the unfiltered flow is no filtered "
+               f"density, which models need; remove sound_speed, or {', '.join(learned)}")
     if learned and settings.volume is not None:
         yield (f"[tracks] volume: models need particles in the whole periodic cube; remove {', '.join(learned)}, or "
                "give box if the flow is periodic")
@@ -98,15 +102,16 @@ def _unfit(scene: Scene) -> Iterator[str]:
 
 def _sections_of(settings: Tracks, learned: bool) -> dict[str, Flow | Tracers]:
     tracks = read_measured(settings)
-    if learned and tracks.complete < LEAST_TRACKS:
-        raise SceneError(f"{settings.file}: only {tracks.complete} of {tracks.about['in_file']} tracks are in all "
-                         f"{len(tracks.times)} frames, but a model needs {LEAST_TRACKS}; give a part of the file with "
-                         "fewer frames")
-    count = tracks.complete if learned else max(round((BOX_LENGTH / tracks.spacing) ** 3), LEAST_TRACKS)
+    present, where = ((tracks.complete, f"all {len(tracks.times)} frames") if settings.filtered
+                      else (int(tracks.starts[1]), "the first frame"))
+    if learned and present < LEAST_TRACKS:
+        raise SceneError(f"{settings.file}: only {present} of {tracks.about['in_file']} tracks are in {where}, but a "
+                         f"model needs {LEAST_TRACKS}; give another part of the file")
+    count = present if learned else max(round((BOX_LENGTH / tracks.spacing) ** 3), LEAST_TRACKS)
     speed = float(np.sqrt(np.mean(tracks.columns["velocity"]**2)))
     turnover = INTEGRAL_SCALE * BOX_LENGTH / speed if speed > 0 else math.inf
     width = None if settings.filter_width is None else settings.filter_width / tracks.unit
-    tracers = Tracers(count=count, filtered=settings.filtered, frame_interval=float(tracks.times[1]),
+    tracers = Tracers(count=count, filtered=settings.filtered or learned, frame_interval=float(tracks.times[1]),
                       filter_width=width, turnovers=max(float(tracks.times[-1] / turnover), 1e-6),
                       field_every=settings.field_every)
     viscosity = 0.0 if settings.viscosity is None else settings.viscosity / tracks.unit**2
@@ -120,23 +125,25 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     """Write ground_truth.h5 of measured tracks; all ranks call it.
 
     Its filtered fields are those of the resolved velocity, which regularised least squares find in the velocities of
-    the tracks. If the tracks follow the unfiltered flow, the filter is applied to these fields. The dissipation rate is
-    the value of the literature for the measured velocity and integral scale (`dissipation_constant`).
+    the tracks. If the tracks follow the unfiltered flow, the filter is applied to these fields; if the scene has a
+    model, the particles of the product are then FilteredTracers. The dissipation rate is the value of the literature
+    for the measured velocity and integral scale (`dissipation_constant`).
     """
-    tracers, tracks = scene.tracers, TrackFrames(comm, scene.tracks)
+    tracers, tracks, filtered = scene.tracers, TrackFrames(comm, scene.tracks), scene.tracks.filtered
+    viscosity = scene.flow.viscosity
     complete, times, spacing = tracks.complete, tracks.times, tracks.spacing
     slab = SlabDecomposition(comm, BOX_LENGTH, tracers.with_count(round((BOX_LENGTH / spacing) ** 3)).planes)
     first, second = tracks.shared(0, 1), tracks.shared(1, 0)
     reference = {"filter_width": tracers.filter_width, "spacing": tracers.spacing, "density_mean": 1.0,
-                 "viscosity": scene.flow.viscosity, **measured_scales(comm, first, second, tracks.times[1])}
-    width = tracers.filter_width if tracers.filtered else NO_FILTER * spacing
-    columns = tracks.frame(0)
+                 "viscosity": viscosity, **measured_scales(comm, first, second, times[1])}
+    width = tracers.filter_width if filtered else NO_FILTER * spacing
+    particles = particles_on(slab, tracks.frame(0))
     found = {"kolmogorov_length": 0.0} | reference
-    for _ in range(2 if scene.flow.viscosity > 0 else 1):  # the second time with Kolmogorov's length in the prior
+    for _ in range(2 if viscosity > 0 else 1):  # the second time with Kolmogorov's length in the prior
         make = partial(solver_of, slab, found | {"spacing": spacing, "filter_width": width})
-        solver, weight, error = best_solver(particles_on(slab, columns), make)
-        flow = FrameFlow(solver.of(particles_on(slab, columns)), columns, tracers)
-        found = flow.scales(scene.flow.viscosity) | reference  # velocity_rms is that of the particles
+        solver, weight, error = best_solver(particles, make)
+        flow = FrameFlow(solver.grid, solver.of(particles).velocity, particles, filtered, tracers.filter_width)
+        found = flow.scales(viscosity) | reference  # velocity_rms is that of the particles
     reference = found
     coarse = SpectralGrid(SlabDecomposition(comm, BOX_LENGTH, tracers.cells), cutoff=(tracers.cells - 1) // 2)
     sound = {"sound_speed": scene.flow.sound_speed or math.inf}
@@ -144,30 +151,43 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         sound["mach_turbulent"] = math.sqrt(2 * flow.energy.sum()) / scene.flow.sound_speed
     with create_product(comm, Path(directory) / STAGES["dns"].file, "ground_truth",
                         stage_provenance(scene, "dns")) as file:
-        trajectory = None
-        if complete >= LEAST_TRACKS:
-            shapes = {name: values.shape[1:] for name, values in first.items() if name != "id"}
-            trajectory = TrajectoryWriter(file, "tracers", complete, BOX_LENGTH, shapes, np.float64)
+        trajectory = traced = memory = None
+        shapes = {name: values.shape[1:] for name, values in first.items() if name != "id"}
+        if tracers.filtered and not filtered:
+            traced, paths = FilteredTracers(slab, tracks.frame(0)), []
+            if viscosity > 0:
+                memory = RememberedVelocity(solver, viscosity, torch.ones_like(solver.grid.shell), MEMORY, weight)
+        if traced is not None or complete >= LEAST_TRACKS:
+            count = complete if traced is None else traced.total
+            trajectory = TrajectoryWriter(file, "tracers", count, BOX_LENGTH, shapes, np.float64)
         fields = FieldWriter(file, "filtered", coarse.cells, {"velocity": 3})
         rows, spectra, near = [], [], None
         for frame, time in enumerate(times):
             if stop is not None:
                 stop.check()
-            if trajectory is not None:
+            if trajectory is not None and traced is None:
                 trajectory.append(frame, time, id_block(comm, complete)[0], tracks.frame(frame, complete=True))
-            if frame % tracers.field_every:
+            if frame % tracers.field_every and traced is None:
                 continue
-            columns = tracks.frame(frame)
+            particles = particles_on(slab, tracks.frame(frame))
             with torch.no_grad():
-                flow = FrameFlow(solver.of(particles_on(slab, columns), near=near), columns, tracers)
-            near = flow.resolved.velocity
-            planes = coarse.backward(regrid(flow.grid, coarse, flow.filtered)) + flow.mean[:, None, None, None]
+                near = memory.of(particles, time) if memory else solver.of(particles, near=near).velocity
+                flow = FrameFlow(solver.grid, near, particles, filtered, tracers.filter_width)
+            if traced is not None:
+                start, columns = traced.follow(flow, times[1] if frame else 0.0)
+                trajectory.append(frame, time, start, columns)
+                paths += [columns] if frame < 2 else []
+                if frame % tracers.field_every:
+                    continue
+            grid, modes = flow.grid.spectral, as_numpy(flow.filtered)
+            planes = coarse.backward(regrid(grid, coarse, modes)) + flow.mean[:, None, None, None]
             fields.append(time, coarse.decomposition.start, {"velocity": planes})
-            row = flow.scales(scene.flow.viscosity) | {"time": time, "energy": flow.energy.sum()}
-            skewness, flatness = gradient_moments(flow.grid, flow.filtered)
-            rows.append(row | {"skewness": skewness, "flatness": flatness}
-                        | component_energies(flow.grid, flow.filtered))
+            row = flow.scales(viscosity) | {"time": time, "energy": flow.energy.sum()}
+            skewness, flatness = gradient_moments(grid, modes)
+            rows.append(row | {"skewness": skewness, "flatness": flatness} | component_energies(grid, modes))
             spectra.append((time, flow.energy, flow.filtered_energy))
+        if traced is not None:
+            reference |= measured_scales(comm, *paths, times[1])
         write_attributes(file.create_group("reference"), {
             **reference, "released_at": 0.0, "energy": float(spectra[0][1].sum()), **sound})
         write_table(file, "statistics", {name: np.array([row[name] for row in rows]) for name in rows[0]})
@@ -175,7 +195,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         write_table(file, "spectra", {"wavenumber": np.arange(table["energy"].shape[1]), **table})
         write_attributes(file.create_group("tracks"), {
             **tracks.about, "complete": complete, "mean_count": tracks.mean_count, "weight": weight,
-            "validation_error": error})
+            "validation_error": error, "traced": traced is not None})
     log.info("dns: %d tracks, on average %.0f in a frame; %d are in each of the %d frames; duration %.3g T, u' = %.3g, "
              "L = %.3g",
              tracks.about["in_file"], tracks.mean_count, complete, len(times),
@@ -190,27 +210,30 @@ class FrameFlow:
 
     Parameters
     ----------
-    resolved : the result of least squares. columns : this rank's rows of the frame.
-    tracers : tells whether the particles follow the filtered velocity, and gives the filter width.
+    grid, modes : the velocity relative to the mean of the `particles`, (3, kz, ky, kx).
+    filtered, filter_width : whether the particles follow the filtered velocity, and the width of the filter.
     """
 
-    def __init__(self, resolved: ResolvedFlow, columns: Mapping[str, np.ndarray], tracers: Tracers) -> None:
-        self.resolved, self.grid = resolved, resolved.grid.spectral
-        comm, velocity = self.grid.decomposition.comm, columns["velocity"]
-        self.mean = comm.allreduce(velocity.sum(0)) / comm.allreduce(len(velocity))
-        whole = resolved.unfiltered if tracers.filtered else resolved.velocity
-        self.filtered = as_numpy(resolved.velocity if tracers.filtered else
-                                 whole * resolved.grid.filter_transfer(tracers.filter_width))
-        square, count = global_sum(comm, np.array([
-            float(resolved.at_particles(resolved.velocity).square().sum()), len(velocity)]))
-        among = square / count / (2 * energy_spectrum(self.grid, as_numpy(resolved.velocity))[1].sum())
-        self.energy, self.filtered_energy = (among * energy_spectrum(self.grid, modes)[1]
-                                             for modes in (as_numpy(whole), self.filtered))
+    def __init__(self, grid: FourierGrid, modes: Tensor, particles: ParticleSet, filtered: bool,
+                 filter_width: float) -> None:
+        self.grid, comm, transfer = grid, grid.decomposition.comm, grid.filter_transfer(filter_width)
+        self.mean = as_numpy(mean_over_ranks(comm, particles.velocity))
+        whole, self.filtered = (modes * (1 / transfer), modes) if filtered else (modes, modes * transfer)
+        among = grid.at(modes, grid.points(particles.position))
+        square, count = global_sum(comm, np.array([float(among.square().sum()), len(particles.id)]))
+        share = square / count / (2 * energy_spectrum(grid.spectral, as_numpy(modes))[1].sum())
+        self.energy, self.filtered_energy = (share * energy_spectrum(grid.spectral, as_numpy(each))[1]
+                                             for each in (whole, self.filtered))
+
+    @torch.no_grad()
+    def at(self, position: np.ndarray) -> np.ndarray:
+        """The filtered velocity (n, 3) at positions on this rank; collective."""
+        return as_numpy(self.grid.at(self.filtered, self.grid.points(torch.from_numpy(position)))) + self.mean
 
     def scales(self, viscosity: float) -> dict[str, float]:
         """The scales of `turbulence_scales`, and `dissipation_rate` eps = C_eps u'^3 / L. C_eps and Re_lambda depend on
         each other, so both are found by iteration."""
-        cutoff = self.resolved.grid.resolved
+        cutoff = self.grid.resolved
         found = turbulence_scales(self.energy, 0.0, 0.0, cutoff)
         speed, length = found["velocity_rms"], found["integral_scale"]
         rate, reynolds = 0.0, math.inf
@@ -218,3 +241,29 @@ class FrameFlow:
             rate = dissipation_constant(reynolds) * speed**3 / length
             reynolds = math.sqrt(15 / (viscosity * rate)) * speed**2 if viscosity > 0 else math.inf
         return turbulence_scales(self.energy, rate, viscosity, cutoff) | {"dissipation_rate": rate}
+
+
+class FilteredTracers:
+    """Particles that follow the filtered velocity of reconstructed fields, by Heun's method from frame to frame.
+
+    They start at the tracks of the first frame, of which `columns` holds this rank's rows. All methods are collective.
+    """
+
+    def __init__(self, slab: SlabDecomposition, columns: Mapping[str, np.ndarray]) -> None:
+        counts, self.slab = slab.comm.allgather(len(columns["id"])), slab
+        self.total, first = sum(counts), sum(counts[:slab.comm.rank])
+        self._now = migrate(slab, {"id": first + np.arange(len(columns["id"])), "position": columns["position"]})
+
+    def follow(self, flow: FrameFlow, step: float) -> tuple[int, dict[str, np.ndarray]]:
+        """Move the particles by a time `step`, 0 in the first frame, to the time of a flow.
+
+        Returns the id of this rank's first row, and its rows of position and velocity in order of id.
+        """
+        if step > 0:
+            ahead = migrate(self.slab, {**self._now, "before": self._now["position"],
+                                        "position": self._now["position"] + step * self._now["velocity"]})
+            velocity = (ahead["velocity"] + flow.at(ahead["position"])) / 2
+            self._now = migrate(self.slab, {"id": ahead["id"], "position": ahead["before"] + step * velocity})
+        self._now["velocity"] = flow.at(self._now["position"])
+        order = IdOrder(self.slab.comm, self._now["id"], self.total)
+        return order.start, {name: order.apply(self._now[name]) for name in ("position", "velocity")}
