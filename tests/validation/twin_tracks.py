@@ -48,7 +48,7 @@ class Case:
     inner: float = 1.0
 
 
-SETS = {"hit": ("whole-8", "whole-16", "whole-32", "filtered-16", "filtered-32"),
+SETS = {"hit": ("whole-8", "whole-16", "whole-32", "filtered-8", "filtered-16", "filtered-32"),
         "hit-256": ("whole-16", "whole-32", "filtered-16", "filtered-32")}
 # Done to the tracks of `hit` alone.
 FURTHER = [

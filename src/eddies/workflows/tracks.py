@@ -38,7 +38,7 @@ from eddies.workflows.track_solver import NO_FILTER, best_solver, particles_on, 
 
 log = logging.getLogger("eddies")
 
-LEAST_TRACKS = 8        # least number of tracks that a model needs; each must be in all frames
+LEAST_TRACKS = 8        # least number of tracks that a model needs
 INTEGRAL_SCALE = 0.2    # integral scale divided by the edge of the box: a guess, for estimates before the run
 MEMORY = 4.0            # memory of the fields that FilteredTracers follow (RememberedVelocity)
 ROUNDS = 20             # iterations for the dissipation rate; each reduces the error to a third
