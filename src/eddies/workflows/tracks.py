@@ -30,7 +30,7 @@ from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.remembered_velocity import RememberedVelocity
 from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Flow, Scene, SceneError, Tracers
-from eddies.scene.sections import Eulerian, Initial, Tracks
+from eddies.scene.sections import Eulerian, Initial, Reconstruction, Tracks
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.workflows.ground_truth.track_frames import TrackFrames, read_measured
 from eddies.workflows.run_directory.fingerprints import stage_provenance
@@ -40,7 +40,6 @@ log = logging.getLogger("eddies")
 
 LEAST_TRACKS = 8        # least number of tracks that a model needs
 INTEGRAL_SCALE = 0.2    # integral scale divided by the edge of the box: a guess, for estimates before the run
-MEMORY = 4.0            # memory of the fields that FilteredTracers follow (RememberedVelocity)
 ROUNDS = 20             # iterations for the dissipation rate; each reduces the error to a third
 
 
@@ -156,7 +155,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         if tracers.filtered and not filtered:
             traced, paths = FilteredTracers(slab, tracks.frame(0)), []
             if viscosity > 0:
-                memory = RememberedVelocity(solver, viscosity, torch.ones_like(solver.grid.shell), MEMORY, weight)
+                memory = RememberedVelocity(solver, viscosity, torch.ones_like(solver.grid.shell),
+                                            Reconstruction().memory, weight)
         if traced is not None or complete >= LEAST_TRACKS:
             count = complete if traced is None else traced.total
             trajectory = TrajectoryWriter(file, "tracers", count, BOX_LENGTH, shapes, np.float64)

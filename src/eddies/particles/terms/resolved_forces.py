@@ -133,7 +133,8 @@ class Forcing(Term):
     """f(k) = A u(k) over 0 < |k| < k_f with A = P / sum |u*(k)|^2: linear forcing of the large scales (Lundgren 2003).
 
     The unfiltered flow is forced by A u*, where u* = u / G is its velocity (`flow/forcing.py`). It receives the power
-    P = `injection_rate`. The filtered flow receives less, A sum |u(k)|^2. Each evaluation computes A anew.
+    P = `injection_rate`. The filtered flow receives less, A sum |u(k)|^2. A follows
+    from the velocity at each evaluation.
     """
 
     Settings = declared.Forcing
