@@ -8,6 +8,7 @@ import pytest
 
 from eddies import open_run, run, write_tracks
 from eddies.io.errors import ProductError
+from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import export, tracks
 from eddies.workflows.ground_truth.track_frames import read_measured
@@ -254,6 +255,34 @@ def test_a_model_learns_from_tracks_of_the_whole_flow(comm, tmp_path, no_figures
         scales = [file["reference"].attrs["acceleration_rms"] for file in (own, true)]
     assert relative(found[5], exact[5]) < 0.05 and relative(found[6] - found[4], exact[6] - exact[4]) < 0.2
     assert scales[0] == pytest.approx(scales[1], rel=0.1)
+
+
+class Vortices:
+    """The steady flow of the stream function psi = cos x + cos z, which is constant along each path."""
+
+    def psi(self, position):
+        return np.cos(position[:, 0]) + np.cos(position[:, 2])
+
+    def at(self, position):
+        return np.column_stack([-np.sin(position[:, 2]), np.zeros(len(position)), np.sin(position[:, 0])])
+
+
+@pytest.mark.mpi(1, 2)
+def test_filtered_tracers_have_the_second_order_of_heun(comm):
+    flow, count = Vortices(), 60
+    start = np.random.default_rng(3).uniform(0, 2 * np.pi, (count, 3))
+    own = slice(comm.rank * count // comm.size, (comm.rank + 1) * count // comm.size)
+    errors = []
+    for steps in (40, 80):
+        traced = tracks.FilteredTracers(SlabDecomposition(comm, 2 * np.pi, 8), {
+            "id": np.arange(count)[own], "position": start[own]})
+        traced.follow(flow, 0.0)
+        for _ in range(steps):
+            first, columns = traced.follow(flow, 4.0 / steps)
+        rows = slice(first, first + len(columns["position"]))
+        errors.append(comm.allreduce(np.sum((flow.psi(columns["position"]) - flow.psi(start[rows]))**2)) ** 0.5)
+    assert 0 < errors[1] < errors[0] / 3.4  # second order has 4 or more, Euler's method 2
+    assert errors[1] < 0.05
 
 
 @pytest.mark.mpi(1)
