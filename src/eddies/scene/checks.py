@@ -8,20 +8,20 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from eddies.import_path import ImportPathError, is_path, load
 from eddies.pipeline import STAGES
 from eddies.scene.model import Model
 from eddies.scene.sections import (INITIAL_FLOWS, Eulerian, Flow, Forcing, Initial, InitialFlow, Kernel, Simulation,
                                    SpinUp, Time, Tracers, Training)
-from eddies.scene.values import Section, import_paths
 
 Problems = Iterator[tuple[str, str]]
 
 # Attributes that a user's class must have, by the key that names the class.
-REQUIRED = {"fluid": ("nonlinear", "linear", "linear_function", "combine", "compressible"), "kind": ("__call__",),
-            "method": ("advance", "frame", "status", "series", "description", "has_density"), "network": ("forward",)}
+REQUIRED = {"flow.fluid": ("nonlinear", "linear", "linear_function", "combine", "compressible"),
+            "initial.kind": ("__call__",),
+            "simulation.method": ("advance", "frame", "status", "series", "description", "has_density")}
 # Reserved names in a run directory, besides the products and checkpoint directories of the stages.
 RESERVED = ("report", "vtkhdf", "lagrangebench", "STOP", "LOCK")
 REALISATION = "realisation-"
@@ -61,23 +61,23 @@ def problem_of_name(variant: str) -> str:
     return ""
 
 
-def check_foreign(flow: Flow, initial: Initial, simulation: Simulation | None, model: Model | None) -> Problems:
-    """Yield a problem if an import path cannot be loaded, or its class lacks an attribute. `Model` checks the terms."""
-    sections: dict[str, Section | None] = {"flow": flow, "initial": initial, "simulation": simulation}
-    if model:
-        sections |= {f"model.{name}": settings for name, settings in model.settings.items()}
-    for section, part in sections.items():
-        for key, path in import_paths(part) if part else ():
-            try:
-                found = load(path)
-            except ImportPathError as error:
-                yield f"{section}.{key}", str(error).partition(": ")[2]
-                continue
-            lacking = [name for name in REQUIRED.get(key, ()) if not hasattr(found, name)]
-            if lacking:
-                yield f"{section}.{key}", f"cannot be used here, because it has no {', '.join(lacking)}; add it"
-            elif key == "network" and not (isinstance(found, type) and issubclass(found, load("torch.nn:Module"))):
-                yield f"{section}.{key}", "must be a class derived from torch.nn.Module"
+def check_foreign(paths: Iterable[tuple[str, str]]) -> Problems:
+    """Yield a problem if an import path cannot be loaded, or its class lacks an attribute. `Model` checks the terms.
+
+    `paths` has a pair of key and import path for each.
+    """
+    for key, path in paths:
+        try:
+            found = load(path)
+        except ImportPathError as error:
+            yield key, str(error).partition(": ")[2]
+            continue
+        lacking = [name for name in REQUIRED.get(key, ()) if not hasattr(found, name)]
+        if lacking:
+            yield key, f"cannot be used here, because it has no {', '.join(lacking)}; add it"
+        elif key.endswith(".network") and not (
+                isinstance(found, type) and issubclass(found, load("torch.nn:Module"))):
+            yield key, "must be a class derived from torch.nn.Module"
 
 
 def check_flow(flow: Flow, initial: Initial, forcing: Forcing | None, model: Model | None) -> Problems:

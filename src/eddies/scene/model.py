@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from eddies.import_path import ImportPathError, is_path, load, short_name
 from eddies.scene.rules import nearest, quoted
 from eddies.scene.terms import DEFAULT_PRESET, GIVES, PRESETS, READS, TERMS, TermBase, TermSettings
-from eddies.scene.values import (SceneError, Section, choice, import_paths, number, product_file, read_section,
+from eddies.scene.values import (SceneError, Section, choice, number, product_file, read_section,
                                  sections, text, texts)
 
 BUILT_IN_PREFIX = "eddies:"  # a [model] path with this prefix names weights of the package
@@ -88,11 +88,6 @@ class Model(Section):
     def damping(self) -> str | None:
         """The name of the parameter with damping rates for a coarse grid, such as "damping.rates"; None without one."""
         return next((f"{name}.{one.damps_by}" for name, one in self.settings.items() if one.damps_by), None)
-
-    @property
-    def foreign(self) -> tuple[str, ...]:
-        """The import paths of the user's terms and networks, each once."""
-        return tuple(dict.fromkeys(path for part in (self, *self.settings.values()) for _, path in import_paths(part)))
 
 
 def replace_terms(table: dict[str, Any], keys: set[str]) -> None:

@@ -29,8 +29,6 @@ __all__ = ["BOX_LENGTH", "REALISATION", "Scene", "SceneError", "builtin_scenes",
 REALISATION = checks.REALISATION
 # The keys of a scene that a variant cannot change.
 SCENE_ONLY_KEYS = ("name", "base", "realisations", VARIANT)
-# The sections that may name classes and functions of the user.
-FOREIGN_IN = ("flow", "initial", "model", "simulation")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,17 +214,10 @@ class Scene(Section):
         """Radius of interaction of pairs; 0 without [tracers]."""
         return self.tracers.radius_of(self.neighbors) if self.tracers else 0.0
 
-    def foreign_in(self, name: str) -> tuple[str, ...]:
-        """The import paths of the user's classes and functions that a section names, each once."""
-        part = getattr(self, name)
-        if isinstance(part, Model):
-            return part.foreign
-        return tuple(dict.fromkeys(path for _, path in import_paths(part))) if part is not None else ()
-
     @property
     def foreign(self) -> tuple[str, ...]:
         """The import paths of the user's fluid, initial flow, terms, networks, and method of the simulation."""
-        return tuple(dict.fromkeys(path for name in FOREIGN_IN for path in self.foreign_in(name)))
+        return tuple(dict.fromkeys(path for _, path in import_paths(self)))
 
     # ---- checks
 
@@ -264,7 +255,7 @@ class Scene(Section):
         flow, tracers, kernel, model, simulation = self.flow, self.tracers, self.kernel, self.model, self.simulation
         present = {field.name for field in fields(self) if getattr(self, field.name) is not None}
         yield from checks.check_names(self.name, self.seed, self.realisations or (), bool(simulation or self.variant))
-        yield from checks.check_foreign(flow, self.initial, simulation, model)
+        yield from checks.check_foreign(import_paths(self))
         yield from checks.check_flow(flow, self.initial, self.forcing, model)
         yield from checks.check_time(self.time, flow, self.forcing, self.spin_up, tracers)
         if tracers is not None:

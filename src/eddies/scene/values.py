@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from eddies.errors import UserError
+from eddies.import_path import is_path
 from eddies.pipeline import STAGES
 from eddies.scene.rules import Bounds, Rule, nearest, quoted, shortened
 
@@ -252,12 +253,15 @@ def _line(key: str, rule: Rule, value: Any) -> str:
 
 
 def import_paths(part: Section) -> Iterator[tuple[str, str]]:
-    """Yield (key, import path) for each import path in a section."""
+    """Yield (key, import path) for each import path in a section and in its inner sections."""
     for field in dataclasses.fields(part):
         rule, value = rule_of(type(part), field), getattr(part, field.name)
         if rule is not None and rule.paths:
             yield from ((field.name, path) for path in ((value,) if isinstance(value, str) else value or ())
-                        if ":" in path)
+                        if is_path(path))
+        inner = {field.name: value} if isinstance(value, Section) else value if field.name == part._holder else {}
+        for name, section in inner.items():
+            yield from ((f"{name}.{key}", path) for key, path in import_paths(section))
 
 
 def expanded(path: str) -> Path:

@@ -113,7 +113,7 @@ def test_a_file_never_has_a_class_imported(comm, tmp_path, own):
     assert "own_source" not in sys.modules and not (tmp_path / "imported").exists()
     comm.Barrier()
     if comm.rank == 0:  # whose path leads to the module
-        assert scene_with(tmp_path, "pressure", "own_source:Drag").model.foreign == ("own_source:Drag",)
+        assert scene_with(tmp_path, "pressure", "own_source:Drag").foreign == ("own_source:Drag",)
         assert (tmp_path / "imported").exists()
 
 

@@ -20,6 +20,7 @@ from eddies.parallel.halo import HaloError
 from eddies.particles.feature_range import FeatureRange, pair_features
 from eddies.particles.smoothing_kernels import SmoothingKernel
 from eddies.scene.scene import SceneError
+from eddies.scene.values import import_paths
 from eddies.workflows.learned.training_data import TrainingData
 
 log = logging.getLogger("eddies")
@@ -37,7 +38,7 @@ Trainer = TypeVar("Trainer")
 def one_step_phases(data: Sequence[TrainingData], kernel: SmoothingKernel | None) -> list[Phase]:
     """Phases of training on the rates of single frames: first the trajectory loss alone, then all losses."""
     settings = data[0].settings
-    if data[0].definition.model.foreign:
+    if [*import_paths(data[0].definition.model)]:  # terms or networks of the user
         first = data[0].frames[0]
         data[0].model.check_terms(first.dynamics.context(first.particles))
     trainers = [each.force_trainer(kernel) for each in data]

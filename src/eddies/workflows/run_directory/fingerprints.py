@@ -12,8 +12,9 @@ from typing import Any
 
 from eddies.import_path import origins
 from eddies.pipeline import STAGES
-from eddies.scene.scene import FOREIGN_IN, Scene
+from eddies.scene.scene import Scene
 from eddies.scene.sections import SET_KEYS
+from eddies.scene.values import import_paths
 
 
 # The keys that only set the duration of a stage. If nothing else differs, a stage can continue from a checkpoint.
@@ -46,7 +47,8 @@ def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> 
         del settings["simulation"]["step_from"]
     if simulation is not None:
         del settings["simulation"]["confirmed_on"]
-    settings |= {f"own_{name}": origins(scene.foreign_in(name)) for name in FOREIGN_IN}
+    settings |= {f"own_{name}": origins(path for key, path in import_paths(scene) if key.startswith(f"{name}."))
+                 for name in ("flow", "initial", "model", "simulation")}  # the sections that may name users' classes
     of_these = {*STAGES[stage].depends_on, stage} & {*scene.stages}
     read = [[key, _without(settings[key], key, (*each.but, *without))]
             for each in STAGES.values() if each.name in of_these for key in each.reads]
