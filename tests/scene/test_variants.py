@@ -63,6 +63,15 @@ def test_the_command_line_reaches_one_variant(tmp_path):
     assert load_scene(path, [], ["variant.wide.training"]).variant["wide"].training.steps == 60
 
 
+def test_a_key_is_changed_for_the_variants_that_keep_it(tmp_path):
+    short = HEAD + 'training.horizons.steps = 2\n[variant.short]\nunset = ["training.horizons"]\n'
+    changed = ["training.horizons.steps=3"]
+    with pytest.raises(SceneError, match="--set training.horizons.steps: has no effect, because each variant removes"):
+        load_scene(written(tmp_path, short), changed)
+    variants = load_scene(written(tmp_path, short + "[variant.long]\n"), changed).variant
+    assert variants["short"].training.horizons is None and variants["long"].training.horizons.steps == 3
+
+
 BAD_OPTIONS = [
     (["training.steps=3"], [], 'the variant "wide" changes this key itself; use --set variant.wide.training.'),
     ([], ["training"], 'the variant "wide" changes this key itself; use --unset variant.wide.training'),

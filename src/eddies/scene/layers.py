@@ -24,6 +24,7 @@ VARIANT = "variant"
 FILE_ONLY_KEYS = ("base", "unset")  # keys that only a file may have
 FILE_KEYS = {"initial": ("path",), "tracks": ("path",), "model": ("path",), "training": ("truths",),
              "simulation": ("step_from", "confirmed_on")}
+OF_VARIANTS = ("model", "training", "simulation", "eulerian")  # sections that a scene with variants does not use itself
 DEEPEST = 3  # largest number of parts of a key, as in section.sub.key; [variant.NAME] adds two
 
 Document = dict[str, Any]
@@ -215,11 +216,12 @@ def _parsed(value: str) -> Any:
 
 
 def check_command_line(given: Layer, variants: Mapping[str, Layer], existing: Iterable[str]) -> None:
-    """Raise SceneError if the command line changes an unknown variant, or a key that a variant changes itself.
+    """Raise SceneError if the command line changes an unknown variant, a key that a variant changes itself, or a key
+    that has no effect because all variants remove it.
 
-    The error names the option that changes the key in this variant alone.
+    The error names the option that changes the key in one variant alone.
     """
-    for option, keys in (("--set", given.values), ("--unset", given.unset)):
+    for option, keys, end in (("--set", given.values, "=..."), ("--unset", given.unset, "")):
         for key in keys:
             first, _, rest = key.partition(".")
             if first == VARIANT and rest:
@@ -227,7 +229,11 @@ def check_command_line(given: Layer, variants: Mapping[str, Layer], existing: It
             for name, layer in variants.items() if first != VARIANT else ():
                 if any(f"{own}.".startswith(f"{key}.") for own in (*layer.values, *layer.unset)):
                     raise SceneError(f'{option} {key}: the variant "{name}" changes this key itself; use '
-                                     f"{option} {VARIANT}.{name}.{key}" + ("=..." if option == "--set" else ""))
+                                     f"{option} {VARIANT}.{name}.{key}{end}")
+            removed = [any(f"{key}.".startswith(f"{own}.") for own in layer.unset) for layer in variants.values()]
+            if first in OF_VARIANTS and removed and all(removed):
+                raise SceneError(f"{option} {key}: has no effect, because each variant removes it; use {option} "
+                                 f"{VARIANT}.NAME.{key}{end}")
 
 
 def check_variant(name: str, variants: Iterable[str], where: str) -> None:
