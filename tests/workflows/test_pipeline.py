@@ -79,7 +79,7 @@ def check_words(path, dataset):
 
 def test_what_check_foresees_is_what_was_run(run_directory):
     from eddies.workflows.foreseen.numbers import estimate, rollout_in
-    from eddies.workflows.foreseen.storage import disk, rollout_bytes, trajectory_bytes
+    from eddies.workflows.foreseen.storage import rollout_bytes, storage, trajectory_bytes
     from eddies.workflows.ground_truth.frame_counts import unfiltered_frames
     scene = load_scene(TINY, CHANGES)
     expected = estimate(scene)
@@ -93,7 +93,7 @@ def test_what_check_foresees_is_what_was_run(run_directory):
     whole = len(unfiltered_frames(scene.simulation, scene.training, scene.tracers.field_every, frames))
     sizes = {"ground_truth": trajectory_bytes(scene.flow, scene.tracers, frames, whole),
              "rollout": rollout_bytes(scene.tracers.particles, course.intervals + 1),
-             "kernel": disk(scene, "train-kernel").kept, "model": disk(scene, "train").kept}
+             "kernel": storage(scene, "train-kernel", 1).kept, "model": storage(scene, "train", 1).kept}
     for name, size in sizes.items():
         assert (run_directory / f"{name}.h5").stat().st_size == pytest.approx(size, rel=0.2), name
 

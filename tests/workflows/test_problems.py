@@ -10,7 +10,7 @@ import pytest
 from eddies.scene.integrators import SCHEMES
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 from eddies.scene.terms import FilteredEquations, StepUnits
-from eddies.workflows.foreseen.storage import memory
+from eddies.workflows.foreseen.storage import storage
 from eddies.workflows.problems import Context, convenient, memory_of_node, problems
 from tests.bad_scenes import INFEASIBLE
 from tests.changed_product import changed
@@ -159,7 +159,7 @@ def test_a_machine_that_is_too_small(comm, tmp_path):
     scene = load_scene(TINY)
     fits = Context(comm, scene.stages, tmp_path, memory=memory_of_node(comm), free_disk=1e9)
     assert problems(scene, fits) == ([], [])
-    size = memory(scene, "dns", comm.size)
+    size = storage(scene, "dns", comm.size).memory
     (small,) = problems(scene, dataclasses.replace(fits, stages=["dns"], memory=(comm.size - 0.5) * size))[1]
     (full,) = problems(scene, dataclasses.replace(fits, free_disk=1e6))[1]
     assert "of memory here" in small and "of disk" in full

@@ -13,7 +13,7 @@ from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.foreseen.ranks import most_ranks
 from eddies.workflows.foreseen.seconds import seconds
-from eddies.workflows.foreseen.storage import disk, in_units, memory, most_disk
+from eddies.workflows.foreseen.storage import Storage, in_units, most_disk, storage
 from eddies.workflows.problems import context_here, problems
 from eddies.workflows.variants import rollouts, steps
 
@@ -21,6 +21,7 @@ log = logging.getLogger("eddies")
 
 TURBULENCE_KEYS = ("velocity_rms", "dissipation_rate", "reynolds_lambda", "turnover_time", "kolmogorov_length",
                    "kolmogorov_time")
+Foreseen = tuple[float | None, Storage]  # wall time, memory and disk of a stage of a scene
 
 
 def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
@@ -59,7 +60,13 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
             work.setdefault((step.variant, stage), []).append(step.scene)
     pages = [run.scene for runs in rollouts(scene, scene.directory).values() for run in runs]
     work[None, "report"] = pages or [scene]
-    costs = [cost(variant, stage, scenes, comm.size) for (variant, stage), scenes in work.items()]
+    costs, needs = [], []
+    for (variant, stage), scenes in work.items():
+        most = min(min(most_ranks(each.ground_truth_alone if stage == "dns" else each).values()) for each in scenes)
+        here, there = ([(seconds(each, stage, ranks), storage(each, stage, ranks)) for each in scenes]
+                       for ranks in (comm.size, most))
+        costs.append(row(stage, variant, here, most, there))
+        needs += [needed for _, needed in here]
     return {
         "scene": scene.name, "stages": list(scene.stages_of_all), "cells": scene.flow.cells,
         "largest_wavenumber": k_max,
@@ -76,30 +83,27 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
         "stage_costs": costs,
         "totals": {"seconds": sum(row["seconds"] or 0.0 for row in costs),
                    "memory": max(row["memory"] for row in costs), "disk": sum(row["disk"] or 0.0 for row in costs),
-                   "most_disk": most_disk(disk(each, stage) for (_, stage), scenes in work.items() for each in scenes)},
+                   "most_disk": most_disk(needs)},
         "warnings": warnings, "refusals": refusals,
     }
 
 
-def cost(variant: str | None, stage: str, scenes: Sequence[Scene], ranks: int) -> dict[str, Any]:
-    """Return a row of `stage_costs`: the cost of a stage for all of `scenes`.
+def row(stage: str, variant: str | None, here: Sequence[Foreseen], most_ranks: int,
+        there: Sequence[Foreseen]) -> dict[str, Any]:
+    """Return a row of `stage_costs`: the cost of a stage for several scenes, on these ranks and on the most ranks that
+    the stage can use (`least_seconds`, `least_memory`).
 
-    `seconds` (wall time) and `memory` (bytes of a rank) hold for `ranks` ranks. `least_seconds` and `least_memory` hold
-    for `most_ranks`, the most ranks that the stage can use. The stage leaves `disk` bytes, and removes `scratch` bytes
-    at its end. Times and `disk` are sums over the scenes.
+    `seconds` (wall time) and `disk` are sums over the scenes, `memory` (bytes of a rank) is the largest. The stage
+    leaves `disk` bytes, and removes `scratch` bytes at its end.
     """
-    most = min(min(most_ranks(each.ground_truth_alone if stage == "dns" else each).values()) for each in scenes)
-
     def total(values: Sequence[float | None]) -> float | None:
         return None if None in values else sum(values)
 
-    return {"stage": stage, "variant": variant, "runs": 1 if stage == "report" else len(scenes),
-            "seconds": total([seconds(each, stage, ranks) for each in scenes]),
-            "memory": max(memory(each, stage, ranks) for each in scenes),
-            "disk": total([disk(each, stage).kept for each in scenes]),
-            "scratch": disk(scenes[0], stage).scratch, "most_ranks": most,
-            "least_seconds": total([seconds(each, stage, most) for each in scenes]),
-            "least_memory": max(memory(each, stage, most) for each in scenes)}
+    return {"stage": stage, "variant": variant, "runs": 1 if stage == "report" else len(here),
+            "seconds": total([each for each, _ in here]), "memory": max(needed.memory for _, needed in here),
+            "disk": total([needed.kept for _, needed in here]), "scratch": here[0][1].scratch, "most_ranks": most_ranks,
+            "least_seconds": total([each for each, _ in there]),
+            "least_memory": max(needed.memory for _, needed in there)}
 
 
 def lines(found: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

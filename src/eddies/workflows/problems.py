@@ -19,7 +19,6 @@ from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm, node_ranks
 from eddies.parallel.reduction import global_min
-from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import ScaleError
 from eddies.pipeline import STAGES
 from eddies.scene.scene import (BOX_LENGTH, Flow, Forcing, Initial, Model, Reconstruction, Scene, SceneError,
@@ -27,7 +26,7 @@ from eddies.scene.scene import (BOX_LENGTH, Flow, Forcing, Initial, Model, Recon
 from eddies.scene.terms import StepUnits
 from eddies.workflows.foreseen.numbers import Estimates, Turbulence, estimate
 from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
-from eddies.workflows.foreseen.storage import Disk, disk, in_units, memory, most_disk
+from eddies.workflows.foreseen.storage import Storage, in_units, most_disk, storage
 from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.ground_truth.scene_flow import given_spectrum, stored_states
 from eddies.workflows.variants import Step, steps
@@ -84,6 +83,7 @@ def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
     made = {file for step in planned for file in step.files}
     refused: dict[str, None] = {}
     doubts: dict[str, list[str]] = {}
+    needs: list[Storage] = []
     for step in planned:
         refused |= dict.fromkeys(f"{step.scene.name}: {problem}" for problem in _infeasible(step, comm, made))
         refused |= dict.fromkeys(directory_problems(step.stages, comm, step.directory))
@@ -91,13 +91,13 @@ def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
         for doubt in _warnings(step, made):
             doubts.setdefault(doubt, []).append(step.variant or "")
         for stage in step.stages:
-            size = memory(step.scene, stage, comm.size)
-            if on_node * size > context.memory:
-                doubts[f"{stage}: {on_node} ranks with about {in_units(size)} each need more than the "
+            needs.append(storage(step.scene, stage, comm.size))
+            if on_node * needs[-1].memory > context.memory:
+                doubts[f"{stage}: {on_node} ranks with about {in_units(needs[-1].memory)} each need more than the "
                        f"{in_units(context.memory)} of memory here; take more nodes, or fewer cells or particles"] = []
     if "report" in context.stages:
         refused |= dict.fromkeys(directory_problems(("report",), comm, context.directory))
-    needed = most_disk(disk(step.scene, stage) for step in planned for stage in step.stages)
+    needed = most_disk(needs)
     if scene.sets and scene.kernel is not None and not scene.variant:
         doubts[f"[tracers] set: is absent, so that only the ground truths of {', '.join(scene.sets)} are made; "
                "choose one of them for kernel, model and rollout"] = []
@@ -135,7 +135,7 @@ def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]
     limits = most_ranks(scene.ground_truth_alone if set(stages) == {"dns"} else scene)
     yield from rank_problems(limits, comm.size)
     if has_single_writer(comm):
-        yield from _large_files({stage: disk(scene, stage) for stage in stages}, comm.size)
+        yield from _large_files({stage: storage(scene, stage, comm.size) for stage in stages}, comm.size)
 
 
 def _strong_forcing(initial: Initial, forcing: Forcing, time: Time) -> Iterator[str]:
@@ -190,7 +190,7 @@ def _too_few_frames(tracers: Tracers, turnover_time: float, check: Callable[[int
             yield f"[tracers] turnovers = {tracers.turnovers:g} is expected to give at most {frames} frames: {error}"
 
 
-def _large_files(needs: Mapping[str, Disk], ranks: int) -> Iterator[str]:
+def _large_files(needs: Mapping[str, Storage], ranks: int) -> Iterator[str]:
     """Yield a problem for each product that is too large for rank 0 to write for all ranks."""
     for stage, needed in needs.items():
         if (size := (needed.kept or 0.0) - needed.other_files) > LARGEST_BYTES:
@@ -417,7 +417,7 @@ def check_ground_truth(stages: Sequence[str], scene: Scene, comm: Comm, director
                      len(Trajectory(file, "tracers").times))
         if {"train", "simulate"} & {*stages}:
             from eddies.workflows.ground_truth.truth import GroundTruth  # imports torch
-            truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes))
+            truth = GroundTruth(file, comm)
             try:
                 truth.scales
             except ScaleError as error:

@@ -12,8 +12,8 @@ from eddies.clock import Clock, ProgressLine
 from eddies.scene.scene import Time, load_scene
 from eddies.workflows.foreseen.numbers import estimate, rollout_in
 from eddies.workflows.foreseen.seconds import START, seconds
-from eddies.workflows.foreseen.storage import (FLOW_PROCESS, TORCH_PROCESS, Disk, disk, flow_memory, memory, most_disk,
-                                               rollout_bytes, trajectory_bytes)
+from eddies.workflows.foreseen.storage import (FLOW_PROCESS, TORCH_PROCESS, Storage, flow_memory, most_disk,
+                                               rollout_bytes, storage, trajectory_bytes)
 from eddies.workflows.ground_truth.frame_counts import unfiltered_frames
 from eddies.workflows.problems import _large_files
 from tests.small_scene import one_model
@@ -146,22 +146,23 @@ def test_memory_of_a_step_is_as_expected(comm, fluid):
 def test_memory_falls_with_the_ranks_and_grows_with_the_frames():
     scene = load_scene("hit-small")
     for stage in ("dns", "train-kernel", "train", "find-step", "simulate"):
-        sizes = [memory(scene, stage, ranks) for ranks in (1, 2, 4, 12)]
+        sizes = [storage(scene, stage, ranks).memory for ranks in (1, 2, 4, 12)]
         assert sizes == sorted(sizes, reverse=True) and sizes[-1] > FLOW_PROCESS
-    few, many = (memory(load_scene("hit-small", [f"training.frames={frames}"]), "train", 1) - TORCH_PROCESS
+    few, many = (storage(load_scene("hit-small", [f"training.frames={frames}"]), "train", 1).memory - TORCH_PROCESS
                  for frames in (16, 34))
     assert many == pytest.approx(2 * few)
 
 
 def test_the_disk_of_the_worst_moment():
-    assert most_disk([Disk(4.0, 2.0), Disk(None, 9.0), Disk(3.0)]) == 13 and most_disk([Disk(2.0)] * 3) == 6
-    kept, scratch, other_files = disk(load_scene("taylor-green", ["flow.cells=256"]), "dns")
+    assert most_disk([Storage(0, 4.0, 2.0), Storage(0, None, 9.0), Storage(0, 3.0)]) == 13
+    assert most_disk([Storage(0, 2.0)] * 3) == 6
+    _, kept, scratch, other_files = storage(load_scene("taylor-green", ["flow.cells=256"]), "dns", 1)
     assert kept - other_files > 4 * 3 * 256**3 and scratch >= other_files > 256**3
 
 
 def test_the_last_state_is_no_part_of_the_largest_product():
     """A limit of 4 GB a file, where rank 0 writes for all."""
-    sizes = {"all in the product": Disk(5e9), "a state beside it": Disk(5e9, other_files=2e9)}
+    sizes = {"all in the product": Storage(0, 5e9), "a state beside it": Storage(0, 5e9, other_files=2e9)}
     assert [name for name, needed in sizes.items() if [*_large_files({"dns": needed}, 2)]] == ["all in the product"]
 
 

@@ -10,10 +10,10 @@ from typing import NamedTuple
 from eddies.cores import threads
 from eddies.flow.history import EVERY
 from eddies.io.checkpoint import KEPT
-from eddies.scene.scene import Flow, Scene, Tracers
+from eddies.scene.scene import Flow, Kernel, Scene, Simulation, Tracers, Training
 from eddies.scene.sections import RECONSTRUCTED
 from eddies.spectral.fourier_passes import BLOCK_BYTES
-from eddies.workflows.foreseen.numbers import estimate
+from eddies.workflows.foreseen.numbers import Estimates, estimate
 from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_PARTICLES, unfiltered_frames, whole_cells
 
 # Memory of a process that holds no field, without and with torch; memory of a report with its figures.
@@ -28,28 +28,49 @@ PARTICLE_BYTES, POINT_BYTES, NEIGHBOR_BYTES, GRADIENT_BYTES, TABLE_BYTES = 800, 
 PRODUCT_BYTES, REPORT_BYTES, SAMPLE_BYTES = 45_000, 10e6, 200
 
 
-def memory(scene: Scene, stage: str, ranks: int) -> float:
-    """Memory of the rank that needs most in a stage."""
-    if stage in ("dns", "report"):
-        return flow_memory(scene.flow, scene.tracers, ranks) if stage == "dns" else REPORT_PROCESS
-    tracers, kernel = scene.tracers, scene.kernel
-    own, planes = tracers.particles / ranks, tracers.planes
-    if stage == "train-kernel":
-        points = tracers.cells**3 / ranks
-        lists = KERNEL_FIELDS * NEIGHBOR_BYTES * points + GRADIENT_BYTES * min(kernel.points, points)
-        return TORCH_PROCESS + KERNEL_FIELDS * TABLE_BYTES * own + lists * kernel.neighbors
-    skin, evaluation = scene.simulation.skin if scene.simulation else 0.0, PARTICLE_BYTES * own
-    if scene.needs_resolved_velocity or stage != "train":
-        evaluation += POINT_BYTES * planes**2 * math.ceil(planes / ranks)
-    if scene.model and "pairs" in scene.model.reads:
-        ghosts = tracers.particles * scene.interaction_radius * (1 + skin) / math.pi if ranks > 1 else 0.0
-        evaluation += PARTICLE_BYTES * ghosts + NEIGHBOR_BYTES * scene.neighbors * (1 + skin) ** 3 * own
-    if stage != "train":
-        return TORCH_PROCESS + evaluation + (CELL_BYTES[True] * planes**3 / ranks if scene.coarse_cells else 0.0)
-    if scene.training and scene.training.field_weight > 0:
-        evaluation += NEIGHBOR_BYTES * kernel.neighbors * own
-    frames = scene.own_training.frames + 2 if scene.own_training else 1  # each has neighbour lists and a grid
-    return TORCH_PROCESS + frames * evaluation
+class Storage(NamedTuple):
+    """Memory of the rank that needs most in a stage, and disk space of the stage.
+
+    `kept` is what the stage leaves in the run directory, None if unknown. `scratch` is what it removes at its end.
+    `other_files` is the part of `kept` that is not in its product.
+    """
+
+    memory: float
+    kept: float | None
+    scratch: float = 0.0
+    other_files: float = 0.0
+
+
+def storage(scene: Scene, stage: str, ranks: int) -> Storage:
+    """Memory and disk space that a stage needs."""
+    tracers, kernel, model, expected = scene.tracers, scene.kernel, scene.model, estimate(scene)
+    if stage == "dns":
+        memory = flow_memory(scene.flow, tracers, ranks)
+        return Storage(memory, *flow_disk(scene.flow, tracers, scene.simulation, scene.training, expected))
+    if stage == "report":
+        return Storage(REPORT_PROCESS, REPORT_BYTES)
+    if stage == "train-kernel":  # planes of five reconstructions, velocity and gradient
+        return Storage(kernel_memory(kernel, tracers, ranks), PRODUCT_BYTES + 80 * tracers.cells**2 + 64 * kernel.steps)
+    evaluation = evaluation_memory(tracers, ranks, scene.neighbors if model and "pairs" in model.reads else 0.0,
+                                   scene.simulation.skin if scene.simulation else 0.0,
+                                   scene.needs_resolved_velocity or stage != "train")
+    if stage == "train":         # samples of rates, and the history
+        training = scene.own_training
+        if scene.training and scene.training.field_weight > 0:
+            evaluation += NEIGHBOR_BYTES * kernel.neighbors * tracers.particles / ranks
+        frames = training.frames + 2 if training else 1  # each has neighbour lists and a grid
+        samples = 48 * min(tracers.particles, TESTED_PARTICLES)
+        return Storage(TORCH_PROCESS + frames * evaluation,
+                       PRODUCT_BYTES + samples + 100 * (training.steps_in_all if training else 0))
+    memory = TORCH_PROCESS + evaluation + (CELL_BYTES[True] * tracers.planes**3 / ranks if scene.coarse_cells else 0.0)
+    if stage == "reconstruct":
+        settings = scene.reconstruction
+        values = sum(RECONSTRUCTED[name] for name in settings.fields) * (settings.cells or tracers.cells) ** 3
+        frames = expected.frame_intervals and math.ceil((expected.frame_intervals + 1) / settings.every)
+        return Storage(memory, frames and PRODUCT_BYTES + 4 * frames * values)
+    if stage == "find-step":
+        return Storage(memory, PRODUCT_BYTES)
+    return Storage(memory, expected.rollout and rollout_bytes(tracers.particles, expected.rollout.intervals + 1))
 
 
 def flow_memory(flow: Flow, tracers: Tracers | None, ranks: int) -> float:
@@ -62,49 +83,45 @@ def flow_memory(flow: Flow, tracers: Tracers | None, ranks: int) -> float:
     return size + sum(3 * real * points + TRACER_BYTES * each.particles / ranks for each in sets)
 
 
-class Disk(NamedTuple):
-    """Disk space of a stage in bytes. `kept` is what the stage leaves in the run directory, None if unknown. `scratch`
-    is what it removes at its end. `other_files` is the part of `kept` that is not in its product."""
-
-    kept: float | None
-    scratch: float = 0.0
-    other_files: float = 0.0
+def kernel_memory(kernel: Kernel, tracers: Tracers, ranks: int) -> float:
+    """Memory of a rank in the training of the kernel."""
+    points = tracers.cells**3 / ranks
+    lists = KERNEL_FIELDS * NEIGHBOR_BYTES * points + GRADIENT_BYTES * min(kernel.points, points)
+    return TORCH_PROCESS + KERNEL_FIELDS * TABLE_BYTES * tracers.particles / ranks + lists * kernel.neighbors
 
 
-def disk(scene: Scene, stage: str) -> Disk:
-    """Disk space that a stage needs."""
-    flow, tracers, expected = scene.flow, scene.tracers, estimate(scene)
-    if stage == "dns":
-        k_max, intervals = flow.largest_wavenumber, expected.frame_intervals
-        statistics = (SAMPLE_BYTES + 8 * (math.ceil(math.sqrt(3) * k_max) + 1)) * ((expected.steps or 0) // EVERY)
-        state = flow.components * (2 * k_max + 1) ** 2 * (k_max + 1) * 2 * flow.real_bytes
-        checkpoints = KEPT * state    # KEPT + 1 exist while one is written; one stays, as `state`
-        if tracers is None:
-            return Disk(state + statistics + 4 * flow.components * flow.cells**3, checkpoints, state)
-        during, after = (
-            trajectory_bytes(flow, tracers, frames,
-                             len(unfiltered_frames(scene.simulation, scene.training, tracers.field_every, frames)))
-            for frames in (intervals or 0, (intervals or 0) + 1))
-        if tracers.sets:  # each set has the statistics; the run directory has the final fields and no last state
-            after += len(tracers.sets) * statistics + 4 * flow.components * flow.cells**3
-            state = 0
-        return Disk(None if intervals is None else state + statistics + after, checkpoints + during, state)
-    if stage == "train-kernel":  # planes of five reconstructions, velocity and gradient
-        return Disk(PRODUCT_BYTES + 80 * tracers.cells**2 + 64 * scene.kernel.steps)
-    if stage == "train":         # samples of rates, and the history
-        steps = scene.own_training.steps_in_all if scene.own_training else 0
-        return Disk(PRODUCT_BYTES + 48 * min(tracers.particles, TESTED_PARTICLES) + 100 * steps)
-    if stage == "reconstruct":
-        settings = scene.reconstruction
-        values = sum(RECONSTRUCTED[name] for name in settings.fields) * (settings.cells or tracers.cells) ** 3
-        frames = expected.frame_intervals and math.ceil((expected.frame_intervals + 1) / settings.every)
-        return Disk(frames and PRODUCT_BYTES + 4 * frames * values)
-    if stage == "simulate":
-        return Disk(expected.rollout and rollout_bytes(tracers.particles, expected.rollout.intervals + 1))
-    return Disk(PRODUCT_BYTES if stage == "find-step" else REPORT_BYTES)
+def evaluation_memory(tracers: Tracers, ranks: int, neighbors: float, skin: float, on_grid: bool) -> float:
+    """Memory of a rank in an evaluation of the model. `neighbors` is 0 for a model without pairs."""
+    own, planes = tracers.particles / ranks, tracers.planes
+    size = PARTICLE_BYTES * own
+    if on_grid:
+        size += POINT_BYTES * planes**2 * math.ceil(planes / ranks)
+    if neighbors:
+        ghosts = tracers.particles * tracers.radius_of(neighbors) * (1 + skin) / math.pi if ranks > 1 else 0.0
+        size += PARTICLE_BYTES * ghosts + NEIGHBOR_BYTES * neighbors * (1 + skin) ** 3 * own
+    return size
 
 
-def most_disk(work: Iterable[Disk]) -> float:
+def flow_disk(flow: Flow, tracers: Tracers | None, simulation: Simulation | None, training: Training | None,
+              expected: Estimates) -> tuple[float | None, float, float]:
+    """The numbers `kept`, `scratch` and `other_files` of the direct simulation."""
+    k_max, intervals = flow.largest_wavenumber, expected.frame_intervals
+    statistics = (SAMPLE_BYTES + 8 * (math.ceil(math.sqrt(3) * k_max) + 1)) * ((expected.steps or 0) // EVERY)
+    state = flow.components * (2 * k_max + 1) ** 2 * (k_max + 1) * 2 * flow.real_bytes
+    checkpoints = KEPT * state    # KEPT + 1 exist while one is written; one stays, as `state`
+    if tracers is None:
+        return state + statistics + 4 * flow.components * flow.cells**3, checkpoints, state
+    during, after = (
+        trajectory_bytes(flow, tracers, frames,
+                         len(unfiltered_frames(simulation, training, tracers.field_every, frames)))
+        for frames in (intervals or 0, (intervals or 0) + 1))
+    if tracers.sets:  # each set has the statistics; the run directory has the final fields and no last state
+        after += len(tracers.sets) * statistics + 4 * flow.components * flow.cells**3
+        state = 0
+    return None if intervals is None else state + statistics + after, checkpoints + during, state
+
+
+def most_disk(work: Iterable[Storage]) -> float:
     """The most disk space that stages need at any moment, if they run one after the other."""
     left = most = 0.0
     for needed in work:
