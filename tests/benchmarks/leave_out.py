@@ -34,7 +34,7 @@ def step_of(comm, terms) -> Call:
 
 def evaluation_of(comm, compressible: bool, forced: bool) -> Call:
     counting = CountingComm(comm)
-    _, fluid, state = fluid_of(counting, compressible, forced)
+    fluid, state = fluid_of(counting, compressible, forced)
     return lambda: fluid.nonlinear(state), counting.sent
 
 

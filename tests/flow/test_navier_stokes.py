@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from mpi4py import MPI
 
 from eddies.clock import Clock
 from eddies.errors import UserError
@@ -22,13 +21,6 @@ def forced(comm):
 
 def largest(array):
     return np.abs(array).max(initial=0)
-
-
-@pytest.mark.mpi(2, 3)
-def test_state_is_the_same_on_any_number_of_ranks(comm, forced):
-    alone = march(*turbulence(MPI.COMM_SELF, 16, rate=0.5), 0.02, 5)
-    own = slice(*forced[0].grid.column_starts[comm.rank :][:2])
-    assert largest(march(*forced, 0.02, 5) - alone[:, :, own]) < 1e-12
 
 
 @pytest.mark.mpi(2)

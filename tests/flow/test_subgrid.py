@@ -6,7 +6,6 @@ import torch
 
 from eddies.flow import initial_fields
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
-from eddies.flow.statistics import energy_spectrum
 from eddies.flow.subgrid import DynamicStress, EddyDamping, SpectralViscosity, StressModel
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.resolved_velocity import ResolvedFlow
@@ -158,11 +157,8 @@ def test_spectral_viscosity_drains_what_an_inertial_range_brings(comm):
     """With E = 1.4 eps^(2/3) k^(-5/3) up to the cut-off it dissipates eps; the sum over shells replaces an integral. A
     resolved flow, without energy at the cut-off, loses nothing."""
     grid, dissipation = make_grid(comm, 48), 0.7
-    velocity = initial_fields.random_velocity(grid, 5, 1.0, 6.0)
-    k, energy = energy_spectrum(grid, velocity)
-    wanted = 1.4 * dissipation ** (2 / 3) * np.maximum(k, 1.0) ** (-5 / 3) * (k <= grid.cutoff) * (k > 0)
-    scale = np.sqrt(np.divide(wanted, energy, out=np.zeros_like(energy), where=energy > 0))
-    velocity *= scale[np.rint(np.sqrt(grid.index_squared)).astype(int)]
+    k = np.arange(1.0, grid.cutoff + 1)
+    velocity = initial_fields.velocity_of_spectrum(grid, 5, k, 1.4 * dissipation ** (2 / 3) * k ** (-5 / 3))
     force = force_of(SpectralViscosity(grid), velocity)
     assert -power(grid, velocity, force) == pytest.approx(dissipation, rel=0.1)
     resolved = initial_fields.random_velocity(grid, 5, 1.0, 2.0)

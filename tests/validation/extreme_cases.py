@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.particles.integrators import INTEGRATORS
 from eddies.scene.terms import PRESETS
-from tests.particles.configurations import LENGTH, OWN_DENSITY, by_id, distributed
+from tests.particles.configurations import LENGTH, OWN_DENSITY, by_id, distributed, dynamics_of
 from tests.particles.configurations import model as model_of
 
 TOTAL, PLANES, SKIN = 125, 9, 0.1  # 1.8 planes of the grid per particle and direction
+# Of a solve: a fixed number, so that ranks and precisions agree; small, so that ill-posed arrangements do not amplify
+# rounding.
 ITERATIONS = 6
 CLOSURES = {
     "pressure": {"pressure": {}, "pairs": {}},
@@ -59,21 +60,12 @@ def random_points(total=TOTAL, seed=5):
     return torch.from_numpy(np.random.default_rng(seed).uniform(0, LENGTH, (total, 3)))
 
 
-def lattice(side):
-    return torch.from_numpy(np.argwhere(np.ones((side,) * 3)) * (LENGTH / side))
-
-
 def set_up(comm, model, position, velocity=None, density=None, dtype=torch.float64):
     """Dynamics and this rank's particles; with the velocity of the flow and the mean density unless given."""
     velocity = flow_velocity(position) if velocity is None else velocity
     density = torch.ones(len(position), dtype=torch.float64) if density is None else density
     slab, particles = distributed(comm, position, velocity, density, planes=PLANES)
-    dynamics = ParticleDynamics(slab, model.to(dtype), SKIN, dtype)
-    if dynamics.resolution is not None:
-        # A fixed number, so that ranks and precisions agree; small, so that ill-posed arrangements do not amplify
-        # rounding.
-        dynamics.resolution.iterations = ITERATIONS
-    return dynamics, particles
+    return dynamics_of(slab, model.to(dtype), SKIN, ITERATIONS, dtype=dtype), particles
 
 
 @torch.no_grad()

@@ -3,14 +3,14 @@
 import pytest
 import torch
 from extreme_cases import (
-    ARRANGEMENTS, TOTAL, acceleration, advance, every_closure, flow_velocity, has_grid, lattice,
-    network_model, random_points, set_up,
+    ARRANGEMENTS, TOTAL, acceleration, advance, every_closure, flow_velocity, has_grid, network_model,
+    random_points, set_up,
 )
 from mpi4py import MPI
 
 from eddies.parallel.reduction import any_rank
 from eddies.particles.integrators import INTEGRATORS
-from tests.particles.configurations import LENGTH, by_id
+from tests.particles.configurations import LENGTH, by_id, lattice
 
 
 def is_finite(comm, particles):

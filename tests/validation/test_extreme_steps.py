@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from extreme_cases import PLANES, SKIN, acceleration, lattice, random_points, set_up, units
+from extreme_cases import PLANES, SKIN, acceleration, random_points, set_up, units
 from mpi4py import MPI
 
 from eddies.particles import moments
@@ -13,7 +13,7 @@ from eddies.particles.context import REGULARISATION
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.integrators import INTEGRATORS
 from eddies.scene.integrators import SCHEMES
-from tests.particles.configurations import LENGTH, Field, distributed, of_terms
+from tests.particles.configurations import LENGTH, Field, distributed, lattice, of_terms
 from tests.particles.configurations import model as model_of
 
 every_integrator = pytest.mark.parametrize("integrator", INTEGRATORS)

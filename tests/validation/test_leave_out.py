@@ -2,33 +2,27 @@
 
 from contextlib import contextmanager
 
-import numpy as np
 import pytest
 import torch
+from flows import turbulence
 
-from eddies.flow import initial_fields
-from eddies.flow.forcing import LinearForcing
-from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
+from eddies.flow.navier_stokes import IncompressibleFluid
 from eddies.learning import force_training
 from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
 from eddies.learning.optimization import Adam
-from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.context import Context
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.integrators import INTEGRATORS
-from eddies.particles.neighborhood import Neighborhood
-from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import WendlandC2
 from eddies.particles.terms.eddy_viscosity import EddyViscosity
 from eddies.scene.terms import PRESETS
-from eddies.spectral.spectral_grid import SpectralGrid
 from tests.parallel.counting import CountingComm
-from tests.particles.configurations import OWN_DENSITY, model
+from tests.particles.configurations import LENGTH, OWN_DENSITY, distributed, lattice, model
 
-LENGTH, PER_SIDE, STEP = 2 * np.pi, 9, 0.001
+PER_SIDE, STEP = 9, 0.001
 SPACING = LENGTH / PER_SIDE
 SCALES = ReferenceScales(filter_width=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0, density=0.01,
                          acceleration=1.0, density_rate=0.02, sound_speed=10.0, viscosity=0.01)
@@ -55,16 +49,11 @@ def counted(*methods):
 
 def set_up(comm, terms, density=True):
     """Dynamics of these terms, and particles on a lattice."""
-    slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
-    z = (np.arange(slab.start, slab.stop) + 0.5) * SPACING
-    across = (np.arange(PER_SIDE) + 0.5) * SPACING
-    position = np.stack(np.meshgrid(across, across, z, indexing="ij"), axis=-1).reshape(-1, 3)
-    columns = {"id": np.arange(len(position)) + slab.start * PER_SIDE**2, "position": position,
-               "velocity": np.sin(position[:, [1, 2, 0]])}
-    if density:
-        columns["density"] = np.ones(len(position))
+    position = lattice(PER_SIDE)
+    columns = [position, torch.sin(position[:, [1, 2, 0]]), *([torch.ones_like(position[:, 0])] if density else ())]
+    slab, particles = distributed(comm, *columns, planes=PER_SIDE)
     lagrangian = model(terms, FlowUnits(SCALES, 1.5 * SPACING, 14.0))
-    return ParticleDynamics(slab, lagrangian, SPACING), ParticleSet.from_numpy(columns)
+    return ParticleDynamics(slab, lagrangian, SPACING), particles
 
 
 def particle_step(comm, terms, density=True):
@@ -113,14 +102,11 @@ def losses_called(comm, **weights):
 
 
 def fluid_of(comm, compressible, forced):
-    """Grid, fluid and state."""
-    grid = SpectralGrid(SlabDecomposition(comm, LENGTH, 12))
-    state = initial_fields.random_velocity(grid, 3, 1.0, 2.0)
-    forcing = LinearForcing(grid, 0.5, 2.0) if forced else None
-    if not compressible:
-        return grid, IncompressibleFluid(grid, 0.1, forcing=forcing), state
-    density = initial_fields.balanced_density(grid, state, 10.0)
-    return grid, CompressibleFluid(grid, 0.1, 10.0, forcing), np.concatenate([state, density[None]])
+    """Fluid and state."""
+    fluid, state = turbulence(comm, 12, rate=0.5 if forced else None)
+    if compressible:
+        return fluid, state
+    return IncompressibleFluid(fluid.grid, fluid.viscosity, forcing=fluid.forcing), state[:3]
 
 
 @pytest.mark.mpi(1)
@@ -153,22 +139,6 @@ def test_a_model_pays_with_transposes_for_the_terms_that_it_has_alone(comm):
     for words, transposes in expected.items():
         sent = messages_of(comm, {word: settings.get(word, {}) for word in words})
         assert sent.count("Alltoallv") == transposes, words
-
-
-@pytest.mark.mpi(2)
-def test_without_a_pair_sum_no_neighbours_are_searched_and_no_density_travels(comm):
-    found = {}
-    for name, terms in BESIDE_THE_RESOLVED.items():
-        with counted((Neighborhood, "update"), (Context, "sum_pairs")) as calls:
-            counting = CountingComm(comm)
-            step = particle_step(counting, terms)
-            counting.sent.clear()
-            step()
-        found[name] = calls.count("update"), "sum_pairs" in calls, counting.sent.count("Sendrecv")
-    assert found["resolved"][0] == 0
-    # Position, velocity and, where a term reads it, density of ghost particles go up and down.
-    for name, messages in (("resolved + pairs", 4), ("with densities", 6)):
-        assert found[name][0] > 0 and found[name][1] and found[name][2] == found["resolved"][2] + messages
 
 
 @pytest.mark.mpi(1)
@@ -247,7 +217,7 @@ def test_a_flow_pays_for_neither_density_nor_forcing_that_it_does_not_have(comm)
     sent, carried = {}, {}
     for compressible, forced in ((False, False), (False, True), (True, False), (True, True)):
         counting = CountingComm(comm)
-        _, fluid, state = fluid_of(counting, compressible, forced)
+        fluid, state = fluid_of(counting, compressible, forced)
         counting.sent.clear()
         counting.bytes = 0
         fluid.nonlinear(state)
