@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from eddies.analysis.lagrangian import (
-    correlation, differences, increment_flatness, minimum_image, near_tetrads, nearest_rows, pairs_at, path_statistics,
+    correlation, differences, increment_flatness, minimum_image, near_tetrads, pairs_at, path_statistics,
     structure_function, tetrad_moments,
 )
 
@@ -119,13 +119,11 @@ def test_increments_of_normal_velocities_have_flatness_three():
 
 
 @pytest.mark.parametrize("spread", [LENGTH, 0.3], ids=["even", "in a corner"])
-def test_nearest_rows(spread):
-    """Two particles in one place, and one that may be far from all others."""
+def test_tetrads_are_a_particle_and_its_three_nearest(spread):
+    """One particle may be far from all others."""
     position = np.random.default_rng(4).uniform(0, spread, (200, 3))
-    position[7], position[0] = position[3], 3.0
-    chosen = np.array([7, 0, 199])
-    apart = np.linalg.norm(minimum_image(position[chosen][:, None] - position[None], LENGTH), axis=-1)
-    apart[np.arange(3), chosen] = np.inf
-    assert np.array_equal(nearest_rows(position, LENGTH, chosen, 3), np.argsort(apart, axis=1)[:, :3].T)
+    position[0] = 3.0
+    apart = np.linalg.norm(minimum_image(position[:, None] - position[None], LENGTH), axis=-1)
+    assert np.array_equal(near_tetrads(position, LENGTH), np.argsort(apart, axis=1)[:, :4].T)
     with pytest.raises(ValueError, match="3 particles"):
-        nearest_rows(position[:3], LENGTH, np.array([0]), 3)
+        near_tetrads(position[:3], LENGTH)

@@ -8,14 +8,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from eddies.analysis.lagrangian import evenly, neighbor_pairs
+from eddies.analysis.lagrangian import evenly, search_tree
 from eddies.analysis.pdfs import bin_probabilities
 from eddies.analysis.rollout import Frames, Rollout
 
 # Bins of the PDF of nearest-neighbour distances, in mean spacings; for random points a share exp(-14) lies beyond.
 DISTANCE_EDGES = np.linspace(0, 1.5, 31)
 SAMPLED = 2**15  # largest number of particles whose nearest neighbour is searched
-PAIRS = 2**22  # one search finds at most about this number of pairs, even if particles have clustered
+PAIRS = 2**22  # about the largest number of pairs of a searched particle and another in its cell of a mean spacing
 CELL = 2.0  # side of the cells in which particles are counted, in mean spacings: about a filter width
 
 
@@ -28,15 +28,9 @@ def nearest_distances(position: np.ndarray, length: float) -> np.ndarray:
 
     Distances are periodic with `length`. Infinite for a single particle.
     """
-    radius = mean_spacing(len(position), length) / 2
-    crowd = _counts(position, length, round(length / (2 * radius))).max()
-    chosen = evenly(len(position), min(SAMPLED, max(PAIRS // crowd, 1)))
-    nearest, missing = np.full(chosen.size, np.inf), np.arange(chosen.size)
-    while missing.size and radius < 2 * length:
-        places, _, distance = neighbor_pairs(position, length, chosen[missing], radius)
-        np.minimum.at(nearest, missing[places], distance)
-        missing, radius = np.flatnonzero(np.isinf(nearest)), 2 * radius
-    return nearest
+    crowd = _counts(position, length, round(len(position) ** (1 / 3))).max()
+    tree, chosen = search_tree(position, length), evenly(len(position), min(SAMPLED, max(PAIRS // crowd, 1)))
+    return tree.query(tree.data[chosen], 2)[0][:, 1]
 
 
 def distance_probabilities(position: np.ndarray, length: float) -> np.ndarray:

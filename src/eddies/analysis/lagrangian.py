@@ -3,15 +3,20 @@
 Model and truth are measured over the same frames, with the same particles.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from eddies.analysis.errors import rms_log_ratio
 from eddies.analysis.rollout import CommonFrames, Frames
-from eddies.kernels.library import library
-from eddies.kernels.neighbors import Box, neighbors_within
+from eddies.parallel.migration import wrap
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 VALUES = 2**22  # about the largest number of values of a column in memory at once, all frames together
 LAGS = 18       # largest number of lags
@@ -67,10 +72,22 @@ def lags_of(longest: int) -> np.ndarray:
     return np.unique(np.rint(np.geomspace(1, longest, LAGS)).astype(int)) if longest else np.empty(0, int)
 
 
+def search_tree(position: np.ndarray, length: float) -> cKDTree:
+    """A tree that finds neighbours among positions (n, 3), periodic with `length`; its `data` are wrapped positions."""
+    from scipy.spatial import cKDTree  # takes a while to import, and `evenly` is used without it
+    # A tree that is neither balanced nor compact is built several times faster.
+    return cKDTree(wrap(position.astype(float), length), boxsize=length, balanced_tree=False, compact_nodes=False)
+
+
 def near_tetrads(position: np.ndarray, length: float) -> np.ndarray:
-    """Row numbers (4, m) in `position` (n, 3) of at most TETRADS particles, each with its 3 nearest neighbours."""
-    chosen = evenly(len(position), TETRADS)
-    return np.concatenate([chosen[None], nearest_rows(position, length, chosen, CORNERS - 1)])
+    """Row numbers (4, m) in `position` (n, 3) of at most TETRADS particles, each with its 3 nearest neighbours.
+
+    Raises ValueError for fewer than four particles.
+    """
+    if len(position) < CORNERS:
+        raise ValueError(f"{len(position)} particles: at least {CORNERS} are needed")
+    tree = search_tree(position, length)
+    return tree.query(tree.data[evenly(len(position), TETRADS)], CORNERS)[1].T
 
 
 def path_statistics(run: Frames, chosen: Sequence[int], tetrads: np.ndarray, length: float) -> PathStatistics:
@@ -211,51 +228,16 @@ def pair_dispersion(position: Iterable[np.ndarray], groups: Sequence[np.ndarray]
     return np.transpose(spread)
 
 
-def neighbor_pairs(position: np.ndarray, length: float, chosen: np.ndarray,
-                   radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs of a chosen particle and another particle within a radius of it, periodic with `length`.
-
-    `chosen` (m,) holds row numbers of `position` (n, 3). Returns three arrays over the pairs: index of the first
-    particle in `chosen`, in ascending order; row number of the other particle; distance.
-    """
-    offsets, rows = neighbors_within(library(), Box(length, True), radius, position[chosen], position, False)
-    places = np.repeat(np.arange(chosen.size), np.diff(offsets))
-    others = rows != chosen[places]
-    places, rows = places[others], rows[others]
-    displacement = minimum_image(position[rows] - position[chosen[places]], length)
-    return places, rows, np.sqrt(np.sum(displacement**2, axis=1))
-
-
 def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], tolerance: float,
              followed: int) -> list[np.ndarray]:
     """For each distance, row numbers (2, m) of the particle pairs at this distance within a relative `tolerance`.
 
     The first particle of a pair is in the first `followed` rows of `position` (n, 3). Each pair appears once.
     """
-    first = np.arange(min(followed, len(position)))
-    radius = 1.001 * (1 + tolerance) * max(distances, default=0.0)
-    first, second, distance = neighbor_pairs(position, length, first, radius)
-    pairs, once = np.stack([first, second]), second > first
-    at_distance = [pairs[:, once & (np.abs(distance - wanted) <= tolerance * wanted)] for wanted in distances]
+    centres, tree = search_tree(position[:followed], length), search_tree(position, length)
+    reach = (1 + tolerance) * max(distances, default=0.0)
+    found = centres.sparse_distance_matrix(tree, reach, output_type="ndarray")
+    found = found[found["i"] < found["j"]]
+    pairs, distance = np.stack([found["i"], found["j"]]), found["v"]
+    at_distance = [pairs[:, np.abs(distance - wanted) <= tolerance * wanted] for wanted in distances]
     return [chosen[:, np.lexsort(chosen[::-1])] for chosen in at_distance]
-
-
-def nearest_rows(position: np.ndarray, length: float, chosen: np.ndarray, count: int) -> np.ndarray:
-    """Row numbers (count, m) of the particles nearest to each chosen particle, nearest first.
-
-    `chosen` (m,) holds row numbers of `position` (n, 3). Raises ValueError if there are fewer other particles than
-    `count`.
-    """
-    if len(position) <= count:
-        raise ValueError(f"{len(position)} particles: at least {count + 1} are needed")
-    nearest = np.full((count, chosen.size), -1)
-    missing, radius = np.arange(chosen.size), 2 * length / len(position) ** (1 / 3)
-    while missing.size:
-        places, rows, distance = neighbor_pairs(position, length, chosen[missing], radius)
-        rows = rows[np.lexsort((rows, distance, places))]
-        ends = np.cumsum(np.bincount(places, minlength=missing.size))
-        begins = np.append(0, ends[:-1])
-        enough = ends - begins >= count
-        nearest[:, missing[enough]] = rows[begins[enough] + np.arange(count)[:, None]]
-        missing, radius = missing[~enough], 2 * radius
-    return nearest
