@@ -30,9 +30,8 @@ def test_pieces_are_the_kernel(kind):
 
 def averages(field, kernel):
     """Averages by the compiled library: volumes, and velocity and gradient at grid points and at particles."""
-    volume = field.volumes(kernel)
-    return [volume, field.velocity_on_whole_grid(kernel, volume), *field.averaged(kernel, volume, field.points),
-            *field.averaged(kernel, volume, field.owned)]
+    return [field.volumes(kernel), field.averaged_on_grid(kernel), *field.averaged(kernel, field.points),
+            *field.averaged(kernel, field.owned)]
 
 
 def averages_by_torch(field, kernel):

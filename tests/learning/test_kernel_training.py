@@ -63,7 +63,7 @@ def test_the_learned_kernel_beats_a_cubic_spline_of_the_wrong_width(comm, spacin
     sample, network, _ = fit(comm, support, 60, (2e-2, 2e-3))
     with torch.no_grad():
         learned, field = network.table(), sample.particles
-        errors = [sample.errors_of(*field.averaged(kernel, field.volumes(kernel), field.points))
+        errors = [sample.errors_of(*field.averaged(kernel, field.points))
                   for kernel in (learned, CubicSpline(support))]
     assert float(integral(learned)) == pytest.approx(1, rel=1e-12)
     fitted, spline = (velocity**2 + gradient**2 for velocity, gradient in errors)

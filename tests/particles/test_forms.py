@@ -1,4 +1,4 @@
-"""Forms of reconstruction: exact polynomials, gradients, any number of ranks, and particles that leave voids."""
+"""Forms of reconstruction: dense equations, gradients, any number of ranks, and particles that leave voids."""
 
 import numpy as np
 import pytest
@@ -38,27 +38,6 @@ def waves(x):
     return torch.stack([torch.sin(x[:, 1]), torch.sin(x[:, 2]), torch.cos(x[:, 0])], dim=1)
 
 
-@pytest.mark.mpi(1)
-@pytest.mark.parametrize("name, power", [("linear", 1), ("quadratic", 2)])
-def test_polynomials_are_exact_but_for_the_ridge(comm, monkeypatch, name, power):
-    """Away from the faces of the box, where they jump. The error with the ridge is its size over the moments of the
-    weight, about 1e-2; without it the error is rounding."""
-    def polynomial(x):
-        y = x - LENGTH / 2
-        return y if power == 1 else torch.stack([y[:, 0] * y[:, 1], y[:, 2] ** 2, y[:, 1] + y[:, 0] ** 2], dim=1)
-
-    field = field_of(comm, polynomial)
-    inside = ((field.points - LENGTH / 2).abs() < LENGTH / 2 - 1.01 * SUPPORT).all(1)
-    x = field.points[inside].requires_grad_()
-    exact = polynomial(x)
-    slope = torch.stack([torch.autograd.grad(exact[:, i].sum(), x, retain_graph=True)[0] for i in range(3)], 1)
-    for ridge, error in ((RIDGE, 0.03), (0.0, 1e-9)):
-        monkeypatch.setattr("eddies.particles.particle_field.RIDGE", ridge)
-        velocity, gradient = form(name).of(field).at(field.points)
-        assert (velocity[inside] - exact).abs().max() < error * exact.abs().max()
-        assert (gradient[inside] - slope).abs().max() < error * slope.abs().max()
-
-
 @pytest.mark.mpi(1, 3)
 @pytest.mark.parametrize("name, velocity_error, gradient_error", [
     ("average", 0.3, 0.9), ("linear", 0.16, 0.24), ("quadratic", 0.04, 0.18), ("kriging", 0.04, 0.18)])
@@ -66,16 +45,15 @@ def test_a_smooth_field_and_its_gradient_on_any_number_of_ranks(comm, name, velo
     """Waves of k = 1, six supports long: an average flattens them by k^2 <x^2>/2, 4 %, and random positions add noise.
     A constant is exact and has no gradient."""
     field = field_of(comm, lambda x: torch.full_like(x, 2.0))
-    made = form(name).of(field)
-    for velocity, gradient in (made.at(field.points), made.at_particles()):
+    for velocity, gradient in (form(name).at(field, points) for points in (field.points, field.owned)):
         assert largest(comm, velocity - 2) < 1e-9 and largest(comm, gradient) < 1e-8
     field = field_of(comm, waves)
-    velocity, gradient = form(name).of(field).at(field.points)
+    velocity, gradient = form(name).at(field, field.points)
     assert largest(comm, velocity - waves(field.points)) < velocity_error
     assert largest(comm, gradient[:, 0, 1] - torch.cos(field.points[:, 1])) < gradient_error
     whole = np.concatenate(comm.allgather(velocity.numpy()))
     alone = comm.Split(comm.rank)
-    assert np.abs(form(name).of(field_of(alone, waves)).velocity_on_grid().numpy() - whole).max() < 1e-9
+    assert np.abs(form(name).on_grid(field_of(alone, waves)).numpy() - whole).max() < 1e-9
     alone.Free()
 
 
@@ -89,9 +67,9 @@ def test_forms_are_those_of_dense_equations(comm, name, dtype, rounding):
     kernel, field = CubicSpline(SUPPORT), field_of(comm, waves, dtype=dtype)
     if name == "published":
         kernel = HermiteKernel(SUPPORT, SIGNED, torch.zeros(4, dtype=torch.float64), SPACING**3)
-    made, points = form("average" if name == "published" else name, kernel).of(field), field.points[5::800]
-    velocity, gradient = made.at(points)
-    assert largest(comm, made.velocity_on_grid()[5::800] - velocity) < rounding
+    made, points = form("average" if name == "published" else name, kernel), field.points[5::800]
+    velocity, gradient = made.at(field, points)
+    assert largest(comm, made.on_grid(field)[5::800] - velocity) < rounding
     volume = field.volumes(kernel).double()
     for row, x in enumerate(points):
         away = field.owned - x
@@ -136,9 +114,9 @@ def test_voids_and_one_sided_neighbours_give_bounded_results(comm, name, kind):
         return first % LENGTH
 
     field = field_of(comm, waves, move=move)
-    made = form(name).of(field)
-    velocity, gradient = made.at(field.points)
-    assert velocity.isfinite().all() and gradient.isfinite().all() and made.at_particles()[1].isfinite().all()
+    velocity, gradient = form(name).at(field, field.points)
+    assert velocity.isfinite().all() and gradient.isfinite().all()
+    assert form(name).at(field, field.owned)[1].isfinite().all()
     # The velocity within clusters varies seven times as fast as waves do, and fits extrapolate it.
     assert velocity.abs().max() < (5 if kind == "clusters" else 3)
     if kind == "clusters":  # zero where no particle is near
@@ -151,7 +129,7 @@ def test_voids_and_one_sided_neighbours_give_bounded_results(comm, name, kind):
 def test_a_quadratic_fit_replaces_kriging_with_too_many_neighbours(comm, monkeypatch, caplog):
     monkeypatch.setattr("eddies.kernels.kriging.MOST_NEIGHBORS", 40)
     field = field_of(comm, waves)
-    kriged, fitted = (form(name).of(field).velocity_on_grid() for name in ("kriging", "quadratic"))
+    kriged, fitted = (form(name).on_grid(field) for name in ("kriging", "quadratic"))
     many = (kriged == fitted).all(1)
     assert kriged.isfinite().all() and 0.5 < many.double().mean() < 1
     assert f"{int(many.sum())} of {len(kriged)} points" in caplog.text

@@ -44,44 +44,28 @@ class Form:
     def support(self) -> float:
         return self.kernel.support
 
-    def of(self, field: ParticleField) -> Reconstructed:
-        """Reconstruct the velocity of the particles of a field; collective."""
-        return Reconstructed(self, field)
+    def at(self, field: ParticleField, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Velocity (k, 3) and gradient (k, 3, 3) [component, direction] of the particles of a field at points (k, 3) of
+        this rank; collective."""
+        if self.name == "average":
+            return field.averaged(self.kernel, points)
+        if self.name == "kriging":
+            return self._kriged(field, points)
+        return field.fitted(self.kernel, DEGREES[self.name], self.mean_volume, points)
 
+    def on_grid(self, field: ParticleField) -> Tensor:
+        """Velocity (m, 3) of the particles of a field at this rank's grid points, z slowest; collective."""
+        if self.name == "average":
+            return field.averaged_on_grid(self.kernel)
+        return self.at(field, field.points)[0]
 
-class Reconstructed:
-    """Velocity reconstructed from particles at one moment. All methods are collective."""
-
-    def __init__(self, form: Form, field: ParticleField) -> None:
-        self.form, self.field = form, field
-        self._volume = field.volumes(form.kernel) if form.name == "average" else None
-
-    def at(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Velocity (k, 3) and gradient (k, 3, 3) [component, direction] at points (k, 3) of this rank."""
-        if self._volume is not None:
-            return self.field.averaged(self.form.kernel, self._volume, points)
-        return self._kriged(points) if self.form.name == "kriging" else self._fitted(DEGREES[self.form.name], points)
-
-    def velocity_on_grid(self) -> Tensor:
-        """Velocity (m, 3) at this rank's grid points, z slowest."""
-        if self._volume is not None:
-            return self.field.velocity_on_whole_grid(self.form.kernel, self._volume)
-        return self.at(self.field.points)[0]
-
-    def at_particles(self) -> tuple[Tensor, Tensor]:
-        """Velocity (n, 3) and gradient (n, 3, 3) at the owned particles."""
-        return self.at(self.field.owned)
-
-    def _fitted(self, degree: int, points: Tensor) -> tuple[Tensor, Tensor]:
-        return self.field.fitted(self.form.kernel, degree, self.form.mean_volume, points)
-
-    def _kriged(self, points: Tensor) -> tuple[Tensor, Tensor]:
+    def _kriged(self, field: ParticleField, points: Tensor) -> tuple[Tensor, Tensor]:
         """Kriging; a quadratic fit where there are too many neighbours or the equations are singular."""
-        velocity, gradient = self.field.kriged(self.form.filter_width, points)
+        velocity, gradient = field.kriged(self.filter_width, points)
         solved = velocity.isfinite().all(1) & gradient.isfinite().all(2).all(1)
         failed = torch.nonzero(~solved).squeeze(1)
         if len(failed):
             log.warning("kriging: %d of %d points have too many neighbours or singular equations; a quadratic fit "
                         "replaces kriging there", len(failed), len(points))
-            velocity[failed], gradient[failed] = self._fitted(2, points[failed])
+            velocity[failed], gradient[failed] = field.fitted(self.kernel, 2, self.mean_volume, points[failed])
         return velocity, gradient

@@ -55,15 +55,20 @@ class ParticleField:
         self._velocity = with_ghosts(self.halo, velocity).to(dtype)
         self.points = grid_points(decomposition, decomposition.planes)
         self._entries: Tensor | None = None
+        self._latest: tuple[SmoothingKernel, Tensor] | None = None  # kernel and result of the last call of `volumes`
 
     @torch.no_grad()
     def volumes(self, kernel: SmoothingKernel) -> Tensor:
         """Volumes (s,) of all local particles: 1 / sum_j W(x_i - x_j), including j = i, or the kernel's mean volume.
-        Collective."""
+
+        The result is kept until another kernel is given. Collective.
+        """
         if kernel.mean_volume is not None:
             return self._velocity.new_full((len(self._position),), kernel.mean_volume)
-        sums = self._sums(kernel, "kernel-sum", 1, self._position, len(self.owned))[0]
-        return with_ghosts(self.halo, 1 / (sums + kernel.value(sums.new_zeros(()))))
+        if self._latest is None or self._latest[0] is not kernel:
+            sums = self._sums(kernel, "kernel-sum", 1, self._position, len(self.owned))[0]
+            self._latest = kernel, with_ghosts(self.halo, 1 / (sums + kernel.value(sums.new_zeros(()))))
+        return self._latest[1]
 
     def volumes_by_table(self, kernel: HermiteKernel) -> Tensor:
         """Volumes of all local particles (s,) for a tabulated kernel; collective, differentiable.
@@ -89,10 +94,10 @@ class ParticleField:
     # ---- methods that record no gradient, by the compiled library
 
     @torch.no_grad()
-    def averaged(self, kernel: SmoothingKernel, volume: Tensor, receivers: Tensor) -> tuple[Tensor, Tensor]:
-        """Average velocity (k, 3) and gradient (k, 3, 3) [component, direction] at any points of this rank; `volume`
-        is the result of `volumes` for this kernel."""
-        columns = torch.cat([volume.unsqueeze(1), self._velocity], dim=1)
+    def averaged(self, kernel: SmoothingKernel, receivers: Tensor) -> tuple[Tensor, Tensor]:
+        """Average velocity (k, 3) and gradient (k, 3, 3) [component, direction] at any points of this rank; collective.
+        """
+        columns = torch.cat([self.volumes(kernel).unsqueeze(1), self._velocity], dim=1)
         columns = torch.cat([columns.new_zeros(len(receivers), 4), columns])
         sums = self._sums(kernel, "kernel-average", 16, torch.cat([receivers, self._position]), len(receivers),
                           tuple(columns.T))
@@ -102,9 +107,9 @@ class ParticleField:
         return average.T, gradient.permute(2, 0, 1)
 
     @torch.no_grad()
-    def velocity_on_whole_grid(self, kernel: SmoothingKernel, volume: Tensor) -> Tensor:
-        """Average velocity (m, 3) at all of this rank's grid points; cheaper than with its gradient."""
-        slab = self.decomposition
+    def averaged_on_grid(self, kernel: SmoothingKernel) -> Tensor:
+        """Average velocity (m, 3) at all of this rank's grid points; cheaper than with its gradient. Collective."""
+        slab, volume = self.decomposition, self.volumes(kernel)
         weighted = volume.unsqueeze(1) * torch.cat([torch.ones_like(volume).unsqueeze(1), self._velocity], dim=1)
         planes = GridPlanes(slab.planes, slab.spacing, slab.start, slab.count, self._box.periodic_z)
         sums = torch.from_numpy(sums_on_grid(library(), planes, _for_library(kernel), self._position.numpy(),

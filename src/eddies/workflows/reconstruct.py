@@ -88,7 +88,7 @@ class NeighbourMethod(Method):
     def of(self, particles: ParticleSet, time: float) -> Tensor:
         slab = self._grid.decomposition
         field = ParticleField(slab, self._form.support, particles.position, particles.velocity)
-        velocity = self._form.of(field).velocity_on_grid().T.reshape(3, slab.count, slab.planes, slab.planes)
+        velocity = self._form.on_grid(field).T.reshape(3, slab.count, slab.planes, slab.planes)
         mean = mean_over_ranks(slab.comm, particles.velocity).to(self._grid.dtype)
         return self._grid.to_modes(velocity.to(self._grid.dtype) - mean[:, None, None, None])
 
@@ -112,8 +112,8 @@ class Source:
             planes = tracers.with_count(round((BOX_LENGTH / self.spacing) ** 3)).planes
             self.slab = SlabDecomposition(comm, BOX_LENGTH, planes)
         else:
-            self.slab = SlabDecomposition(comm, BOX_LENGTH, tracers.planes)
-            self.truth = truth = GroundTruth(file, self.slab)
+            self.truth = truth = GroundTruth(file, comm)
+            self.slab = truth.decomposition
             self.times, self.spacing, self.most = truth.times, tracers.spacing, truth.total
             self.unit, self.corner = 1.0, np.zeros(3)
 

@@ -13,7 +13,6 @@ from torch import nn
 
 from eddies.analysis.lagrangian import evenly
 from eddies.io.checkpoint import Guard
-from eddies.io.hdf5 import open_product
 from eddies.io.provenance import product_provenance
 from eddies.io.weights import load_tables, load_weights, save_weights
 from eddies.learning.kernel_training import KernelLossWeights, KernelSample, KernelTrainer
@@ -29,10 +28,10 @@ from eddies.particles.forms import DEGREES, Form
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, SmoothingKernel, WendlandC2, integral
 from eddies.pipeline import STAGES
-from eddies.scene.scene import BOX_LENGTH, Kernel, Scene
+from eddies.scene.scene import Kernel, Scene
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS
-from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.ground_truth.truth import GroundTruth, open_truth
 from eddies.workflows.learned.training_phases import take_all_steps
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 
@@ -53,8 +52,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     prepare_torch("cpu", comm)
     settings, directory = scene.kernel, Path(directory)
     support = scene.kernel_support
-    with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as file:
-        truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.cells))
+    with open_truth(comm, directory / STAGES["dns"].file, planes=scene.tracers.cells) as truth:
         seen = np.flatnonzero(truth.fields.times <= scene.window * truth.times[-1])
         chosen = evenly(len(seen), KERNEL_FIELDS)
         samples = [load_sample(truth, index, support) for index in chosen]
@@ -156,8 +154,7 @@ def compare(kernels: dict[str, SmoothingKernel], sample: KernelSample) -> dict[s
     slices["truth_velocity"] = _middle_plane(slab, sample.field[:, 0])
     slices["truth_gradient"] = _middle_plane(slab, sample.gradient[:, 0, 0])
     for name, kernel in kernels.items():
-        velocity, derivative = sample.particles.averaged(
-            kernel, sample.particles.volumes(kernel), sample.particles.points)
+        velocity, derivative = sample.particles.averaged(kernel, sample.particles.points)
         errors[f"velocity_error_{name}"], errors[f"gradient_error_{name}"] = sample.errors_of(velocity, derivative)
         errors[f"integral_{name}"] = float(integral(kernel))
         slices[f"velocity_{name}"] = _middle_plane(slab, velocity[:, 0])
@@ -169,9 +166,9 @@ def errors_of_forms(kernel: SmoothingKernel, sample: KernelSample, scales: Refer
     """Errors of OTHER_FORMS on a field; empty for a kernel that may be negative. Collective."""
     errors = {}
     for name in OTHER_FORMS if kernel.mean_volume is None else ():
-        made = Form(name, kernel, scales.filter_width, scales.spacing**3).of(sample.particles)
+        form = Form(name, kernel, scales.filter_width, scales.spacing**3)
         errors[f"velocity_error_{name}"], errors[f"gradient_error_{name}"] = sample.errors_of(
-            *made.at(sample.particles.points))
+            *form.at(sample.particles, sample.particles.points))
     return errors
 
 

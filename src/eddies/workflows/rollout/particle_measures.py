@@ -13,7 +13,7 @@ from eddies.analysis.rollout import Frames
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import ReferenceScales
-from eddies.particles.forms import Form, Reconstructed
+from eddies.particles.forms import Form
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.resolved_velocity import ResolvedVelocity
@@ -37,20 +37,24 @@ class FieldsOfParticles:
 
     def gradients(self, particles: Frames, frame: int) -> np.ndarray:
         """Velocity gradients (n, 3, 3) [component, direction] at the particles."""
-        return self._once("gradients", particles, frame,
-                          lambda: as_numpy(self._made(particles, frame).at_particles()[1]))
+        def made() -> np.ndarray:
+            field = self._field(particles, frame)
+            return as_numpy(self.form.at(field, field.owned)[1])
+
+        return self._once("gradients", particles, frame, made)
 
     def velocity(self, particles: Frames, frame: int) -> np.ndarray:
         """The velocity (3, z, y, x) on the grid."""
         return self._once("velocity", particles, frame,
-                          lambda: self._by_component(self._made(particles, frame).velocity_on_grid(), 3))
+                          lambda: self._by_component(self.form.on_grid(self._field(particles, frame)), 3))
 
     def plane(self, particles: Frames, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Velocity (3, y, x) and magnitude of the vorticity (y, x) at the grid points in the plane z = pi."""
         axis = torch.arange(self.slab.planes, dtype=torch.float64) * self.slab.spacing
         y, x = torch.meshgrid(axis, axis, indexing="ij")
         middle = torch.full_like(x, self.slab.planes // 2 * self.slab.spacing)
-        velocity, gradient = self._made(particles, frame).at(torch.stack([x, y, middle], -1).reshape(-1, 3))
+        points = torch.stack([x, y, middle], -1).reshape(-1, 3)
+        velocity, gradient = self.form.at(self._field(particles, frame), points)
         antisymmetric = gradient - gradient.transpose(1, 2)  # its norm is sqrt(2) times the vorticity
         vorticity = antisymmetric.square().sum((1, 2)).div(2).sqrt()
         return self._by_component(velocity, 2), as_numpy(vorticity).reshape([self.slab.planes] * 2)
@@ -65,13 +69,12 @@ class FieldsOfParticles:
             self._kept[name] = key, make()
         return self._kept[name][1]
 
-    def _made(self, particles: Frames, frame: int) -> Reconstructed:
-        return self._once("made", particles, frame, lambda: self._reconstruct(particles, frame))
+    def _field(self, particles: Frames, frame: int) -> ParticleField:
+        def made() -> ParticleField:
+            position, velocity = (torch.from_numpy(particles.read(frame, name)) for name in ("position", "velocity"))
+            return ParticleField(self.slab, self.form.support, position, velocity)
 
-    @torch.no_grad()
-    def _reconstruct(self, particles: Frames, frame: int) -> Reconstructed:
-        position, velocity = (torch.from_numpy(particles.read(frame, name)) for name in ("position", "velocity"))
-        return self.form.of(ParticleField(self.slab, self.form.support, position, velocity))
+        return self._once("field", particles, frame, made)
 
     def _by_component(self, velocity: torch.Tensor, dimensions: int) -> np.ndarray:
         return as_numpy(velocity).T.reshape(3, *[self.slab.planes] * dimensions)
