@@ -14,7 +14,7 @@ def test_front_of_known_points():
 
 
 def row(name, seconds, early, late):
-    return {"label": name, "seconds": seconds, "early": early, "late": late}
+    return {"label": name, "wall_seconds": seconds, "early": early, "late": late}
 
 
 OTHERS = [row("none", 1, 0.5, 0.9), row("grid", 4, 0.3, 0.1), row("sph", 20, None, None)]
@@ -22,7 +22,7 @@ WORDS = {"early": "early error", "late": "late error"}
 
 
 def verdict_on(model, others=OTHERS):
-    return verdict(model, others, "seconds", WORDS)
+    return verdict(model, others, WORDS)
 
 
 def test_a_method_is_worth_its_cost_where_no_cheaper_one_is_as_accurate():
@@ -53,7 +53,7 @@ def test_the_cheapest_grid_is_as_accurate_at_every_time():
     times, learned = {"early": "T/2", "late": "1 T"}, row("learned", 8, 0.1, 0.2)
 
     def sentence(model, grids=grids, times=times):
-        return cheapest_grid(model, grids, "seconds", times)
+        return cheapest_grid(model, grids, times)
 
     for model in (learned, learned | {"early_spread": 1.0, "late_spread": 1.0}):
         assert "grid-48; it costs 0.5 times" in sentence(model)

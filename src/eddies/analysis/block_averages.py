@@ -18,11 +18,6 @@ class Estimate:
     value: float
     error: float
 
-    @property
-    def known_error(self) -> float | None:
-        """The error, or None where it is NaN."""
-        return self.error if np.isfinite(self.error) else None
-
 
 @dataclass(frozen=True)
 class Blocks:

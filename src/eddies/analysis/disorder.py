@@ -4,13 +4,11 @@ Randomly placed particles that follow a solenoidal flow stay randomly placed. Th
 oscillate.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from eddies.analysis.lagrangian import evenly, search_tree
 from eddies.analysis.pdfs import bin_probabilities
-from eddies.analysis.rollout import Frames, Rollout
+from eddies.analysis.rollout import Rollout
 
 # Bins of the PDF of nearest-neighbour distances, in mean spacings; for random points a share exp(-14) lies beyond.
 DISTANCE_EDGES = np.linspace(0, 1.5, 31)
@@ -63,13 +61,6 @@ def _counts(position: np.ndarray, length: float, side: int) -> np.ndarray:
     """Number of particles in each of side^3 cells."""
     cell = np.floor(position * (side / length)).astype(int) % side
     return np.bincount(np.ravel_multi_index(cell.T, (side,) * 3), minlength=side**3)
-
-
-def count_variance_series(frames: Frames, chosen: Sequence[int], length: float) -> dict[str, np.ndarray]:
-    """Time series over chosen frames, by name: time and count_variance."""
-    return {"time": frames.times[np.asarray(chosen)],
-            "count_variance": np.array([count_variance(frames.read(int(frame), "position"), length)
-                                        for frame in chosen])}
 
 
 def momentum_drift(start: np.ndarray, end: np.ndarray) -> float:

@@ -4,12 +4,13 @@ u' is the rms of a velocity component, L the integral scale, eps the dissipation
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from eddies.analysis.block_averages import Blocks, Estimate
+from eddies.measures import finite
 
 # Sreenivasan, Phys. Fluids 7, 2778 (1995); Yeung & Zhou, Phys. Rev. E 56, 1746 (1997).
 KOLMOGOROV_CONSTANT = (1.5, 1.64)
@@ -183,8 +184,8 @@ class StationarySpan:
 def comparison(span: StationarySpan) -> list[Row]:
     """Quantities of isotropic turbulence in this flow, and their values in the literature at its Re_lambda."""
     def averaged(key: str, label: str, values: np.ndarray, *literature) -> Row:
-        error = span.block_mean(values).known_error
-        return replace(Row(key, label, *span.average(values), *literature), error=error)
+        error = finite(span.block_mean(values).error)
+        return Row(key, label, *span.average(values), *literature, error=error)
 
     c = span.columns
     reynolds, trend = span.mean("reynolds_lambda"), span.energy_trend
@@ -206,7 +207,7 @@ def comparison(span: StationarySpan) -> list[Row]:
         *(averaged(f"share_{name[-1]}", f"energy of u_{name[-1]} over the mean of the components", values, 1.0,
                    "isotropy") for name, values in zip(COMPONENTS, span.component_shares())),
         Row("energy_trend", "trend of the energy, per turnover", trend.value, None, 0.0, "stationarity",
-            trend.known_error),
+            finite(trend.error)),
         Row("energy_imbalance", "(injection − dissipation − dE/dt) / dissipation", span.energy_imbalance, None, 0.0,
             "energy budget"),
         Row("time_step", "time step", span.mean("time_step")),

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-Method = Mapping[str, Any]  # keys: label; costs and errors (None: unknown); KEY_spread (standard deviation of KEY)
+Method = Mapping[str, Any]  # keys: label; COST and errors (None: unknown); KEY_spread (standard deviation of KEY)
+COST = "wall_seconds"
 
 
 def pareto_front(cost: np.ndarray, error: np.ndarray) -> np.ndarray:
@@ -25,28 +26,25 @@ def pareto_front(cost: np.ndarray, error: np.ndarray) -> np.ndarray:
     return np.array(sorted(front, key=lambda index: (cost[index], error[index])), dtype=int)
 
 
-def verdict(model: Method, others: Sequence[Method], cost: str, measures: Mapping[str, str]) -> list[str]:
+def verdict(model: Method, others: Sequence[Method], measures: Mapping[str, str]) -> list[str]:
     """Two texts: the measures in which the model is worth its cost, and its rivals in the other measures.
 
     The model is worth its cost in a measure if it has no rival. A rival is another method that costs no more and is at
     least as accurate. Errors count as equal if they differ by at most the larger of their spreads over realisations.
     A method that lacks the cost or the error is no rival. For each measure, the text names the cheapest rival and the
-    number of further ones. Without other methods, there is one text that says so.
-
-    Parameters
-    ----------
-    cost : key of the cost. measures : names of the errors in words, by key.
+    number of further ones. Without other methods, there is one text that says so. `measures` maps keys of errors to
+    their names in words.
     """
     if not others:
         return ["No other method was run."]
     name, worth, beaten, unknown = model["label"], [], [], []
     for key, words in measures.items():
         short = words.partition(" (")[0]
-        if None in (model[key], model[cost]):
+        if None in (model[key], model[COST]):
             unknown.append(short)
             continue
-        rivals = sorted((row for row in others if None not in (row[key], row[cost])
-                         and row[cost] <= model[cost] and not _worse(row, model, key)), key=lambda row: row[cost])
+        rivals = sorted((row for row in others if None not in (row[key], row[COST])
+                         and row[COST] <= model[COST] and not _worse(row, model, key)), key=lambda row: row[COST])
         if rivals:
             beaten.append(f"{short}: {rivals[0]['label']}" + (f" and {len(rivals) - 1} more" if rivals[1:] else ""))
         else:
@@ -58,21 +56,21 @@ def verdict(model: Method, others: Sequence[Method], cost: str, measures: Mappin
             " ".join(found) or "In every measure all other methods are slower or less accurate."]
 
 
-def cheapest_grid(model: Method, grids: Sequence[Method], cost: str, times: Mapping[str, str]) -> str:
+def cheapest_grid(model: Method, grids: Sequence[Method], times: Mapping[str, str]) -> str:
     """A sentence that names the cheapest grid whose velocity error is at most the model's at all `times`.
 
     `times` maps keys of errors to the times in words. Means over realisations are compared. The sentence is empty
     without `times`, or if the model's cost or one of its errors is None.
     """
-    if not times or None in [model[key] for key in (cost, *times)]:
+    if not times or None in [model[key] for key in (COST, *times)]:
         return ""
     limit = f"has at most the velocity error of {model['label']} after {' and '.join(times.values())}"
-    kept = [row for row in grids if None not in [row[key] for key in (cost, *times)]
+    kept = [row for row in grids if None not in [row[key] for key in (COST, *times)]
             and all(row[key] <= model[key] for key in times)]
     if not kept:
         return f"No grid {limit}."
-    best = min(kept, key=lambda row: row[cost])
-    return f"The cheapest grid that {limit} is {best['label']}; it costs {best[cost] / model[cost]:.2g} times as much."
+    best = min(kept, key=lambda row: row[COST])
+    return f"The cheapest grid that {limit} is {best['label']}; it costs {best[COST] / model[COST]:.2g} times as much."
 
 
 def break_even(first: float, each: float, rival_first: float, rival_each: float) -> float:

@@ -84,15 +84,12 @@ class SpectraAt:
         return np.arange(len(self.model))
 
     def error(self, of: str, filter_wavenumber: float) -> float:
-        """`spectrum_error` of "model" or "truth" against the filtered flow, up to k_d or the last shell."""
-        return spectrum_error(getattr(self, of), self.filtered, self._largest(filter_wavenumber))
+        """`spectrum_error` of "model" or "truth" against the filtered flow, up to k_d."""
+        return spectrum_error(getattr(self, of), self.filtered, filter_wavenumber)
 
     def bands(self, of: str, filter_wavenumber: float) -> dict[str, float]:
-        """`band_ratios` of "model" or "truth" to the filtered flow, up to k_d or the last shell."""
-        return band_ratios(getattr(self, of), self.filtered, self._largest(filter_wavenumber))
-
-    def _largest(self, filter_wavenumber: float) -> float:
-        return min(filter_wavenumber, float(self.wavenumber[-1]))
+        """`band_ratios` of "model" or "truth" to the filtered flow, up to k_d."""
+        return band_ratios(getattr(self, of), self.filtered, filter_wavenumber)
 
 
 @dataclass(frozen=True)

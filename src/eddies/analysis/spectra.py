@@ -8,15 +8,16 @@ from eddies.analysis.errors import rms_log_ratio
 def spectrum_error(energy: np.ndarray, reference: np.ndarray, largest_wavenumber: float) -> float:
     """Root mean square of ln(E(k) / E_reference(k)) over the shells 1 <= k <= largest_wavenumber, at least over k = 1.
 
-    `energy` and `reference` are (shells,), from k = 0 on. Not finite if one of them has an empty shell.
+    `energy` and `reference` are (shells,), from k = 0 on. Shells beyond the last one count as absent. Not finite if one
+    of them has an empty shell.
     """
-    shells = slice(1, _last_shell(largest_wavenumber) + 1)
+    shells = slice(1, _last_shell(largest_wavenumber, energy) + 1)
     return rms_log_ratio(energy[shells], reference[shells])
 
 
 def band_ratios(energy: np.ndarray, reference: np.ndarray, largest_wavenumber: float) -> dict[str, float]:
-    """Ratio of `energy` to `reference` in the bands of shells "1-2", "3-4", "5-8", ... up to `largest_wavenumber`."""
-    last, ratios, first, end = _last_shell(largest_wavenumber), {}, 1, 2
+    """Ratio of `energy` to `reference` in the bands of shells "1-2", "3-4", "5-8", ... as for `spectrum_error`."""
+    last, ratios, first, end = _last_shell(largest_wavenumber, energy), {}, 1, 2
     while first <= last:
         end = min(end, last)
         band = slice(first, end + 1)
@@ -26,8 +27,8 @@ def band_ratios(energy: np.ndarray, reference: np.ndarray, largest_wavenumber: f
     return ratios
 
 
-def _last_shell(largest_wavenumber: float) -> int:
-    return max(int(largest_wavenumber + 1e-9), 1)
+def _last_shell(largest_wavenumber: float, energy: np.ndarray) -> int:
+    return min(max(int(largest_wavenumber + 1e-9), 1), len(energy) - 1)
 
 
 def vorticity(velocity: np.ndarray) -> np.ndarray:

@@ -115,8 +115,8 @@ def mean_spectra(run: Rollout, span: StationarySpan) -> tuple[np.ndarray, tuple[
     spectra = np.array([run.spectra["model"][int(frame)] for frame in chosen])
     known = min(spectra.shape[1], span.spectra.shape[1])
     spectra, flow = spectra[:, :known], (_transfer(run, span) * span.spectrum)[:known]
-    cutoff, blocks = min(run.filter_wavenumber, known - 1.0), Blocks.of(run.model.times[chosen] / run.turnover, 1.0)
-    error = blocks.of_mean(spectra, lambda mean: spectrum_error(mean, flow, cutoff))
+    blocks = Blocks.of(run.model.times[chosen] / run.turnover, 1.0)
+    error = blocks.of_mean(spectra, lambda mean: spectrum_error(mean, flow, run.filter_wavenumber))
     return np.arange(known), (flow, blocks.means(spectra).mean(axis=0)), error
 
 

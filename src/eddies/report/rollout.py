@@ -250,8 +250,11 @@ def _add_disorder(shown: Section, run: Rollout, main: bool) -> None:
     ]
     if not main:
         return
-    counts = {name: disorder.count_variance_series(frames, run.before_broken(name), run.length)
-              for name, frames in both.items()}
+    counts = {}
+    for name, frames in both.items():
+        finite = run.before_broken(name)
+        counts[name] = frames.times[finite], [disorder.count_variance(frames.read(int(frame), "position"), run.length)
+                                              for frame in finite]
     shown.add_figure(
         "particle-disorder", "Disorder of the particles",
         rollout_figures.particle_disorder(distances, counts, run.turnover),

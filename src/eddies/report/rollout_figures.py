@@ -202,12 +202,12 @@ def path_statistics(model: PathStatistics, truth: PathStatistics, turnover: floa
 
 
 @styled
-def particle_disorder(distances: Mapping[str, np.ndarray], counts: Mapping[str, Mapping[str, np.ndarray]],
+def particle_disorder(distances: Mapping[str, np.ndarray], counts: Mapping[str, tuple[np.ndarray, Sequence[float]]],
                       turnover: float) -> Figure:
     """Draw the PDF of nearest-neighbour distances, and the variance of particle counts over time.
 
     distances: by "truth" and "model", probabilities (bins,) between the edges disorder.DISTANCE_EDGES. counts: by the
-    same names, tables with the columns time and count_variance.
+    same names, times and variances of counts.
     """
     figure, axes = panels(1, 2, (4.0, 3.1))
     edges = disorder.DISTANCE_EDGES
@@ -216,7 +216,8 @@ def particle_disorder(distances: Mapping[str, np.ndarray], counts: Mapping[str, 
     nearest.plot(fine, disorder.random_distance_density(fine), color=GUIDE, linestyle=":", label="random points")
     for name, line in LINES.items():
         nearest.plot(centres, distances[name] / np.diff(edges), **line)
-        variance.plot(counts[name]["time"] / turnover, counts[name]["count_variance"], **line)
+        times, variances = counts[name]
+        variance.plot(times / turnover, variances, **line)
     nearest.set(title="Nearest neighbour", xlabel="distance / mean spacing", ylabel="PDF", ylim=(0, None))
     nearest.legend()
     variance.axhline(1, color=GUIDE, linestyle=":")

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
-from eddies.analysis.pareto import cheapest_grid, pareto_front, verdict
+from eddies.analysis.pareto import COST, cheapest_grid, pareto_front, verdict
 from eddies.measures import DRAWN, MEASURES, SHOWN
 from eddies.report.figures import (DNS, FILTERED, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels,
                                    plain_log_ticks, styled)
@@ -23,7 +23,6 @@ from eddies.report.page import Metric, Section
 Row = Mapping[str, Any]
 
 KEY = "variants"
-COST = "wall_seconds"
 MARKERS = list(zip((MODEL, TRUTH, SECOND, FOURTH, THIRD, DNS, FILTERED), "os^DvPX"))
 # Titles of the table columns to the right of the measures, by the key of the number in a row.
 COSTS = {"end": "end of the rollout (T)", "stopped_at": "became unstable at (T)", "wall_seconds": "wall seconds per T",
@@ -78,13 +77,13 @@ class ErrorAgainstTime:
         numbers = [row if is_stable(row) else {**row, **dict.fromkeys(self.drawn)} for row in self.rows]
         subject = next(row for row in numbers if row["name"] == self.subject)
         others = [row for row in numbers if row is not subject]
-        sentences = verdict(subject, others, COST, {key: MEASURES[key] for key in self.drawn})
+        sentences = verdict(subject, others, {key: MEASURES[key] for key in self.drawn})
         grids = [row for row in others if row["on_grid"] and is_stable(row)]
         if grids and is_stable(subject):
             end = f"{subject['end'] or 0:.2g} T"
             times = {"velocity_error_half": "T/2"} | ({} if end == "0.5 T" else {"velocity_error_end": end})
             known = {measure: words for measure, words in times.items() if subject[measure] is not None}
-            sentences.append(cheapest_grid(subject, grids, COST, known))
+            sentences.append(cheapest_grid(subject, grids, known))
         return [sentence for sentence in sentences if sentence]
 
     def finished(self, measure: str) -> list[Row]:
