@@ -17,7 +17,7 @@ import torch
 from mpi4py import MPI
 
 from eddies.io.hdf5 import open_product
-from eddies.parallel.slab import SlabDecomposition
+from eddies.io.trajectories import Trajectory
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.flow_units import FlowUnits, resolved_wavenumber
 from eddies.particles.fourier_grid import FourierGrid
@@ -25,7 +25,6 @@ from eddies.particles.model import build_model
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import WEIGHT, ResolvedVelocity
 from eddies.report.figures import DNS, FOURTH, GUIDE, MODEL, SECOND, TRUTH, letter, panels, png, styled
-from eddies.scene.scene import BOX_LENGTH
 from eddies.scene.terms import Pressure, Stress, Viscosity
 from eddies.workflows.ground_truth.truth import GroundTruth
 
@@ -62,9 +61,9 @@ class Known:
 def measure(path, shares=SHARES, iterations=ITERATIONS):
     """All errors of a run directory's ground truth, ready for JSON."""
     with open_product(MPI.COMM_SELF, Path(path) / "ground_truth.h5", "ground_truth") as file:
-        side = round(GroundTruth(file, SlabDecomposition(MPI.COMM_SELF, BOX_LENGTH, 8)).total ** (1 / 3))
+        side = round(Trajectory(file, "tracers").total ** (1 / 3))
         # Two cells a particle, so that the largest of the wavenumbers fits in.
-        truth = GroundTruth(file, SlabDecomposition(MPI.COMM_SELF, BOX_LENGTH, 2 * side))
+        truth = GroundTruth(file, MPI.COMM_SELF, planes=2 * side)
         known = Known(truth, len(truth.times) // 2)
     highest = [int(share * known.nyquist) for share in shares]
     return {

@@ -4,13 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from eddies.io.hdf5 import open_product
 from eddies.io.weights import save_weights
-from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.smoothing_kernels import KernelNetwork
-from eddies.scene.scene import BOX_LENGTH, load_scene
+from eddies.scene.scene import load_scene
 from eddies.workflows import dns
-from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.learned.model import initial_model
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.run_directory.fingerprints import stage_provenance
@@ -116,10 +114,10 @@ def write_kernel(comm, directory, scene):
                  stage_provenance(scene, "train-kernel"), {"history": {"step": np.zeros(1)}})
 
 
-def scales_of(comm, directory, planes=6):
+def scales_of(comm, directory):
     """The scales of the ground truth in a directory."""
-    with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
-        return GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, planes)).scales
+    with open_truth(comm, directory / "ground_truth.h5") as truth:
+        return truth.scales
 
 
 def write_model(comm, directory, scene, scales, bound=1e3, features=5):

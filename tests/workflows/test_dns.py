@@ -9,8 +9,7 @@ from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.provenance import read_provenance
 from eddies.io.trajectories import Trajectory
-from eddies.parallel.slab import SlabDecomposition
-from eddies.scene.scene import BOX_LENGTH, SceneError, load_scene
+from eddies.scene.scene import SceneError, load_scene
 from eddies.scene.sections import SpinUp
 from eddies.workflows import dns
 from eddies.workflows.ground_truth.scene_flow import build_fluid, initial_state
@@ -138,7 +137,7 @@ def test_scales_are_those_of_the_release_however_long_the_flow_is_followed(comm,
             columns = {column: np.stack([trajectory.read(frame, column) for frame in (0, 1)])
                        for column in trajectory.columns if column not in ("position", "image")}
             interval = trajectory.times[1] - trajectory.times[0]
-            truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 16))
+            truth = GroundTruth(file, comm)
             release = truth.scales
     assert truth.has_density == (name == TINY) == (release.sound_speed is not None)
     assert len(trajectory.times) > 2 and scales[0] == scales[1]

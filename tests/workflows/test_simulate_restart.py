@@ -42,7 +42,7 @@ def products(comm, shared_folder):
     """A folder with a ground truth, a kernel, and each of the models, and the scene."""
     folder = shared_folder()
     scene = prepared(comm, folder / "run", side=9, overrides=["tracers.field_cells=12"])  # enough for three slabs
-    scales = scales_of(comm, folder / "run", 9)
+    scales = scales_of(comm, folder / "run")
     for name, model in MODELS.items():
         if comm.rank == 0:
             (folder / name).mkdir()

@@ -306,12 +306,17 @@ class Tracers(Section):
 
     @property
     def planes(self) -> int:
-        """Cells along each side of the grid of the resolved velocity; the slabs of particles end at its planes.
+        """Cells along each side of the grid of the resolved velocity; the slabs of particles end at its planes."""
+        return planes_for(self.particles)
 
-        The number is 1.75 N^(1/3), rounded to even. The highest resolved wavenumber is 1.5 times the Nyquist wavenumber
-        of the particles. Its wavelength is then 2.3 cells, which cubic splines can represent.
-        """
-        return 2 * round(0.875 * self._per_side)
+
+def planes_for(particles: int) -> int:
+    """`Tracers.planes` for a number of particles N: 1.75 N^(1/3), rounded to even.
+
+    The highest resolved wavenumber is 1.5 times the Nyquist wavenumber of the particles. Its wavelength is then 2.3
+    cells, which cubic splines can represent.
+    """
+    return 2 * round(0.875 * round(math.cbrt(particles), 9))
 
 
 #: Defaults of keys of [kernel], and the values that replace them in each preset.

@@ -27,18 +27,17 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table
+from eddies.io.hdf5 import create_product, write_attributes, write_table
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import IdOrder
-from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.particles.exchanges import relative_error
 from eddies.pipeline import STAGES
 from eddies.scene.integrators import MOST_COURANT, SCHEMES
-from eddies.scene.scene import BOX_LENGTH, Scene, SceneError, Simulation
+from eddies.scene.scene import Scene, SceneError, Simulation
 from eddies.time_stepping import ETDRK4
-from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.ground_truth.truth import GroundTruth, open_truth
 from eddies.workflows.rollout.method import METHODS, Method, TimeStep, make_method
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 
@@ -201,7 +200,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     Raises SceneError if no step converges.
     """
     directory, settings, began = Path(directory), scene.simulation, time.perf_counter()
-    slab, device = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes), prepare_torch(scene.device, comm)
+    device = prepare_torch(scene.device, comm)
     paths = [directory / STAGES["dns"].file, *settings.confirming_files]
     stop = stop or StopRequest(comm)
 
@@ -209,8 +208,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         return short_rollout(make_method(scene, step, stretch.truth, stretch.frame, directory), step, stretch, stop)
 
     with ExitStack() as files, torch.no_grad():
-        opened = [files.enter_context(open_product(comm, path, "ground_truth")) for path in paths]
-        truths = [GroundTruth(file, slab, device) for file in opened]
+        truths = [files.enter_context(open_truth(comm, path, device)) for path in paths]
         for path, truth in zip(paths, truths):
             if truth.total != truths[0].total:
                 raise SceneError(f"{scene.name}: [simulation] confirmed_on: {path} holds {truth.total} particles, not "

@@ -11,15 +11,14 @@ import torch
 from eddies.clock import pace_in_words
 from eddies.io.frame_segments import FrameSegments
 from eddies.io.checkpoint import Guard
-from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table
+from eddies.io.hdf5 import create_product, write_attributes, write_table
 from eddies.parallel.communicator import Comm
-from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
-from eddies.scene.scene import BOX_LENGTH, Scene
+from eddies.scene.scene import Scene
 from eddies.workflows.ground_truth.frame_counts import rollout_start
-from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.rollout.course import Course, frame_layout
 from eddies.workflows.rollout.method import TimeStep, make_method
 from eddies.workflows.rollout.particle_run import forcing_of
@@ -36,11 +35,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     rollout continues from its newest checkpoint.
     """
     directory, settings, device = Path(directory), scene.simulation, prepare_torch(scene.device, comm)
-    slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)
     guard = Guard(comm, directory / STAGES["simulate"].checkpoints, stage_fingerprint(scene, "simulate"), stop,
                   " of the rollout")
-    with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as truth_file, torch.no_grad():
-        truth = GroundTruth(truth_file, slab, device)
+    with open_truth(comm, directory / STAGES["dns"].file, device) as truth, torch.no_grad():
         start = rollout_start(settings, scene.tracers, scene.seen_in(directory), len(truth.times), truth.field_frames)
         step = None
         if (path := step_path(settings, directory)) is not None:
@@ -48,7 +45,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             step = TimeStep(found["integrator"], found["size"])
         method = make_method(scene, step, truth, start, directory)
         saved = guard.checkpoints.newest()
-        layout = frame_layout(truth.total, slab.length, method.has_density)
+        layout = frame_layout(truth.total, truth.decomposition.length, method.has_density)
         segments = FrameSegments(comm, guard.checkpoints.path, layout, () if saved is None else saved.files)
         turnover = truth.reference["eddy_turnover_time"]
         count = int(np.ceil(settings.turnovers * turnover / settings.frame_interval - 1e-9))

@@ -156,8 +156,7 @@ def rest_of_training(definition: ModelDefinition, few: Training, frames: int, di
     Returns the wall time of this work, the number of steps, and the mean seconds of a step.
     """
     comm, seconds, stepping, number = stop.comm, 0.0, 0.0, 0
-    with open_truths(directory / STAGES["dns"].file, few.truth_files, definition.tracers, comm, device) as (
-            truth, trained_on):
+    with open_truths(directory / STAGES["dns"].file, few.truth_files, comm, device) as (truth, trained_on):
         kernel_file = directory / STAGES["train-kernel"].file
         kernel = load_form(comm, kernel_file, truth.scales, truth.device).kernel if few.field_weight > 0 else None
         data = training_data(definition, few, trained_on)

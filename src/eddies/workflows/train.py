@@ -44,7 +44,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         return
     definition, settings, device = ModelDefinition.of(scene), scene.training, prepare_torch(scene.device, comm)
     own_file = directory / STAGES["dns"].file
-    with open_truths(own_file, settings.truth_files, scene.tracers, comm, device) as (truth, trained_on):
+    with open_truths(own_file, settings.truth_files, comm, device) as (truth, trained_on):
         # Only the field loss averages with the kernel.
         kernel_file = directory / STAGES["train-kernel"].file
         kernel = load_form(comm, kernel_file, truth.scales, truth.device).kernel if settings.field_weight > 0 else None

@@ -27,7 +27,7 @@ def written(comm, directory, density=True):
 def read(comm, path, ask):
     """The result of `ask`, and the stored times and columns (frames, particles, ...)."""
     with open_product(comm, path, "ground_truth") as file:
-        answer = ask(GroundTruth(file, SlabDecomposition(comm, LENGTH, 16)))
+        answer = ask(GroundTruth(file, comm))
         stored = Trajectory(file, "tracers")
         columns = {name: np.stack([stored.read(frame, name) for frame in range(FRAMES)]) for name in stored.columns}
         return answer, stored.times, columns
@@ -42,8 +42,8 @@ def test_a_field_at_the_points_of_all_ranks_is_the_stored_one(comm, tmp_path):
     cells = round(len(stored) ** (1 / 3))
 
     def ask(truth):
-        slab = SlabDecomposition(comm, LENGTH, cells - 1)
-        return GroundTruth(truth._file, slab).field_at(0, grid_points(slab, cells))
+        other = GroundTruth(truth._file, comm, planes=cells - 1)
+        return other.field_at(0, grid_points(other.decomposition, cells))
 
     found = np.concatenate(comm.allgather(read(comm, path, ask)[0]))
     assert np.array_equal(found, stored)
@@ -92,5 +92,5 @@ def test_a_value_that_is_not_finite_is_refused_by_all_ranks(comm, tmp_path):
         comm.Barrier()
         with pytest.raises(ProductError, match=f"ground_truth.h5: /{dataset}, frame {where[0]}: .*not finite"):
             with open_product(comm, path, "ground_truth") as file:
-                ask(GroundTruth(file, SlabDecomposition(comm, LENGTH, 16)))
+                ask(GroundTruth(file, comm))
         comm.Barrier()

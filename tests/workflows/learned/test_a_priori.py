@@ -5,11 +5,9 @@ from types import SimpleNamespace
 import pytest
 from mpi4py import MPI
 
-from eddies.io.hdf5 import open_product
-from eddies.parallel.slab import SlabDecomposition
-from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.learned.a_priori import _given_rate_error
-from tests.workflows.synthetic_run import LENGTH, write_ground_truth
+from tests.workflows.synthetic_run import write_ground_truth
 
 
 @pytest.mark.mpi(2)
@@ -19,6 +17,5 @@ def test_a_density_equal_to_the_true_one_changes_at_the_true_rate(comm, tmp_path
     comm.Barrier()
     exact = SimpleNamespace(model=SimpleNamespace(integrates_density=True),
                             rates=lambda particles: SimpleNamespace(density=particles.density))
-    with open_product(comm, tmp_path / "ground_truth.h5", "ground_truth") as file:
-        truth = GroundTruth(file, SlabDecomposition(comm, LENGTH, 16))
+    with open_truth(comm, tmp_path / "ground_truth.h5") as truth:
         assert _given_rate_error(truth, exact, 2) < 1e-12

@@ -84,7 +84,7 @@ def made(comm, directory, *overrides, runs=("own",)):
 
 
 def opened(scene, comm, directory):
-    return open_truths(directory / "ground_truth.h5", scene.training.truth_files, scene.tracers, comm, CPU)
+    return open_truths(directory / "ground_truth.h5", scene.training.truth_files, comm, CPU)
 
 
 def trained_on(scene, *directories):

@@ -12,14 +12,13 @@ import torch
 
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.trajectories import Trajectory
-from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import resolved_wavenumber
 from eddies.particles.integrators import INTEGRATORS, RungeKutta
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.scene.integrators import SCHEMES
 from eddies.scene.scene import BOX_LENGTH, Model, SceneError, load_scene
 from eddies.workflows import report, simulate, train
-from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.rollout.method import METHODS, make_method
 from eddies.workflows.rollout.particle_run import SOLVES, ParticleRun
 from tests.workflows.small_rollout import OWN_METHOD, prepared, scales_of, scene_text, with_method
@@ -28,8 +27,7 @@ pytestmark = pytest.mark.usefixtures("quick_spectra")
 
 
 def method_of(comm, directory, scene, start):
-    with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
-        truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes))
+    with open_truth(comm, directory / "ground_truth.h5") as truth:
         method = make_method(scene, None, truth, start, directory)
         with torch.no_grad():
             return method, *method.frame(0.0)

@@ -2,38 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import torch
 
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import File, ProductError, read_attributes
+from eddies.io.hdf5 import File, ProductError, open_product, read_attributes
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_all_ranks
+from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import id_block, migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import RATES, ReferenceScales
+from eddies.scene.sections import planes_for
 from eddies.scene.terms import Forcing
 
+CPU = torch.device("cpu")
 Result = TypeVar("Result")
 
 
 class GroundTruth:
     """An open ground_truth.h5 that all ranks read. A particle is on the rank whose slab of `decomposition` holds it.
-    Frames for training and models go to `device`.
+    Frames for training and models go to `device`. The slabs have `planes` in all, by default those of the grid of the
+    resolved velocity.
 
     For an incompressible fluid no density is stored: `has_density` is false and columns of the density are missing.
     All ranks raise ProductError if one of them reads a value that is not finite.
     """
 
-    def __init__(self, file: File, decomposition: SlabDecomposition,
-                 device: torch.device = torch.device("cpu")) -> None:
-        self.decomposition, self.device, self._file = decomposition, device, file
+    def __init__(self, file: File, comm: Comm, device: torch.device = CPU, planes: int | None = None) -> None:
+        self.device, self._file = device, file
         self.trajectory, self.fields = Trajectory(file, "tracers"), FieldSeries(file, "filtered")
         self.times, self.total = self.trajectory.times, self.trajectory.total
+        self.decomposition = SlabDecomposition(comm, self.trajectory.length, planes or planes_for(self.total))
         self.reference = read_attributes(file, "reference")
         #: the forcing after the release of the tracers, None if there is none
         self.forcing = Forcing(**read_attributes(file, "forcing")) if "forcing" in file else None
@@ -118,3 +124,10 @@ class GroundTruth:
     def _together(self, read: Callable[[], Result]) -> Result:
         """Read on this rank. If one rank raises ProductError, all ranks raise it."""
         return on_all_ranks(self.decomposition.comm, read, ProductError)
+
+
+@contextmanager
+def open_truth(comm: Comm, path: Path, device: torch.device = CPU, planes: int | None = None) -> Iterator[GroundTruth]:
+    """Open a ground_truth.h5; collective."""
+    with open_product(comm, path, "ground_truth") as file:
+        yield GroundTruth(file, comm, device, planes)

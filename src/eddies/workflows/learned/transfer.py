@@ -9,16 +9,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from eddies.io.hdf5 import open_product
 from eddies.io.provenance import others_trained_on
 from eddies.io.weights import save_weights
 from eddies.parallel.communicator import Comm
-from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
-from eddies.scene.scene import BOX_LENGTH, Scene
+from eddies.scene.scene import Scene
 from eddies.workflows.ground_truth.frame_counts import last_seen
-from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.learned.a_priori import evaluate, evaluation_frames
 from eddies.workflows.learned.model import load_model
 from eddies.workflows.learned.source import ModelDefinition, ModelSource, read_source
@@ -35,9 +33,8 @@ def run(scene: Scene, comm: Comm, directory: Path) -> None:
     of the training are kept as `source_a_priori` if the source has them. The cost of training is copied too.
     """
     source, definition = read_source(scene, comm), ModelDefinition.of(scene)
-    slab, device = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes), prepare_torch(scene.device, comm)
-    with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as file:
-        truth = GroundTruth(file, slab, device)
+    device = prepare_torch(scene.device, comm)
+    with open_truth(comm, directory / STAGES["dns"].file, device) as truth:
         model = load_model(definition, comm, source.path, truth.scales).to(device).forced(truth.forcing)
         dtype = next((parameter.dtype for parameter in model.parameters()), torch.float64)
         last = last_seen(scene.seen_in(directory), len(truth.times))

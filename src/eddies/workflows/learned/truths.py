@@ -11,17 +11,15 @@ import torch
 
 from eddies.errors import UserError
 from eddies.io.hdf5 import File, open_product
-from eddies.io.trajectories import Trajectory
 from eddies.parallel.communicator import Comm
-from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.rules import quoted
-from eddies.scene.scene import BOX_LENGTH, Tracers, Training
+from eddies.scene.scene import Tracers, Training
 from eddies.workflows.ground_truth.frame_counts import trained_frames
-from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.ground_truth.truth import GroundTruth, open_truth
 
 
 @contextmanager
-def open_truths(own_file: Path, named: Sequence[Path], tracers: Tracers, comm: Comm,
+def open_truths(own_file: Path, named: Sequence[Path], comm: Comm,
                 device: torch.device) -> Iterator[tuple[GroundTruth, list[GroundTruth]]]:
     """Open the ground truth of a run, and the list of ground truths that are named for training; collective.
 
@@ -29,7 +27,7 @@ def open_truths(own_file: Path, named: Sequence[Path], tracers: Tracers, comm: C
     """
     with ExitStack() as files:
         def opened(path: Path) -> GroundTruth:
-            return _truth_in(files.enter_context(open_product(comm, path, "ground_truth")), tracers, comm, device)
+            return files.enter_context(open_truth(comm, path, device))
 
         own = opened(own_file)
         yield own, [own if path.resolve() == own_file.resolve() else opened(path) for path in named or (own_file,)]
@@ -57,20 +55,13 @@ def truth_problems(settings: Training, tracers: Tracers, reads: Collection[str],
     return problems
 
 
-def _truth_in(file: File, tracers: Tracers, comm: Comm,
-              device: torch.device = torch.device("cpu")) -> GroundTruth:
-    """An open ground truth, on slabs for its own number of particles."""
-    planes = tracers.with_count(Trajectory(file, "tracers").total).planes
-    return GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, planes), device)
-
-
 def _problems_of(file: File, settings: Training, tracers: Tracers, reads: Collection[str],
                  comm: Comm) -> Iterator[str]:
     """Reasons why an open ground truth of another run does not fit [training], [tracers] and the inputs `reads`."""
     if "particles/tracers" not in file:
         yield "holds no tracers to learn from; give the run of a scene with [tracers]"
         return
-    truth = _truth_in(file, tracers, comm)
+    truth = GroundTruth(file, comm)
     scales = truth.scales
     own_ratio, other_ratio = tracers.filter_width / tracers.spacing, scales.filter_width / scales.spacing
     if not math.isclose(own_ratio, other_ratio, rel_tol=1e-6):

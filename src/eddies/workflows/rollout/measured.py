@@ -245,7 +245,7 @@ def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
             yield MeasuredRollout(Rollout(attributes, model, NOTHING, model.length, {}, {}, {}, None, **tables,
                                           without_truth=missing), provenance, directory)
             return
-        ground = GroundTruth(truth_file, SlabDecomposition(alone, model.length, 1))
+        ground = GroundTruth(truth_file, alone)
         truth = TrueParticles(ground.trajectory, attributes["start_time"], model.times)
         kernel, fields = directory / "kernel.h5", None
         if kernel.exists():
