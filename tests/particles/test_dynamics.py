@@ -186,8 +186,8 @@ def test_settled_particles_stay_until_one_moves_too_far(comm):
     slab, particles = distributed(comm, *state())
     dynamics = dynamics_of(slab, model(pairs={}))
     with torch.no_grad():
-        settled, companions = dynamics.settle(particles, {"velocity": particles.velocity})
-        assert torch.equal(companions["velocity"], settled.velocity)
+        settled, other = dynamics.settle(particles, particles)
+        assert torch.equal(other.velocity, settled.velocity) and other.id is settled.id
         dynamics.rates(settled)
         near, far = (replace(settled, position=settled.position + torch.tensor([0.0, 0.0, way * SKIN]))
                      for way in (0.49, 0.51))
@@ -199,15 +199,16 @@ def test_without_a_list_particles_change_rank_as_soon_as_one_leaves_its_slab(com
     slab, particles = distributed(comm, *state())
     dynamics = dynamics_of(slab, model(MODELS["resolved"]))
     with torch.no_grad():
-        settled, _ = dynamics.settle(particles)
+        [settled] = dynamics.settle(particles)
         assert torch.equal(settled.id, particles.id) and torch.equal(settled.position, particles.position)
         position = particles.position.clone()
         position[particles.id == 7, 2] = slab.upper
-        moved, companions = dynamics.settle(replace(particles, position=position), {"velocity": particles.velocity})
+        moved, before = dynamics.settle(replace(particles, position=position), particles)
     assert torch.all((moved.position[:, 2] >= slab.lower) & (moved.position[:, 2] < slab.upper))
-    assert torch.equal(companions["velocity"], moved.velocity)
-    before, after = set(particles.id.tolist()), set(moved.id.tolist())
-    assert comm.allreduce(sorted(before - after)) == comm.allreduce(sorted(after - before)) == [7] * (comm.size > 1)
+    assert torch.equal(before.velocity, moved.velocity)
+    left, came = (sorted(set(one.id.tolist()) - set(other.id.tolist()))
+                  for one, other in ((particles, moved), (moved, particles)))
+    assert comm.allreduce(left) == comm.allreduce(came) == [7] * (comm.size > 1)
 
 
 @pytest.mark.mpi(1, 2)

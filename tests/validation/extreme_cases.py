@@ -72,7 +72,7 @@ def set_up(comm, model, position, velocity=None, density=None, dtype=torch.float
 def acceleration(comm, model, position, **given):
     """Accelerations of all particles by id, on every rank."""
     dynamics, particles = set_up(comm, model, position, **given)
-    particles, _ = dynamics.settle(particles)
+    [particles] = dynamics.settle(particles)
     return by_id(comm, particles, dynamics.rates(particles).acceleration, len(position))
 
 

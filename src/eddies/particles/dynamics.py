@@ -88,33 +88,35 @@ class ParticleDynamics:
         if self.resolution is not None:
             self.resolution.load_state_dict(state)
 
-    def settle(self, particles: ParticleSet,
-               companions: dict[str, Tensor] | None = None) -> tuple[ParticleSet, dict[str, Tensor]]:
+    def settle(self, particles: ParticleSet, *others: ParticleSet) -> list[ParticleSet]:
         """Move particles to the ranks of their slabs if halo and list are outdated; collective.
 
         With a resolved velocity but no list, they move once a particle is outside its slab. Integrators call `settle`
-        before they evaluate the rates. `companions` are further columns (n, ...) that move with the particles. Returns
-        the particles and the companions. Nothing changes rank while a gradient is recorded: that would cut it.
+        before they evaluate the rates. `others` are further states of the same particles, whose rows move too. Returns
+        all states. Nothing changes rank while a gradient is recorded: that would cut it.
         """
-        companions = companions or {}
+        states = [particles, *others]
         if self.fixed_ranks:
-            return particles, companions
+            return states
         if self.neighborhood is None and (self.resolution is None or self.decomposition.size == 1):
             if self.resolution is not None:
                 farthest_outside(self.decomposition, particles)
-            return replace(particles, position=self.box.wrap(particles.position)), companions
-        columns = particles.columns()
-        recorded = torch.is_grad_enabled() and any(column.requires_grad for column in columns.values())
+            return [replace(particles, position=self.box.wrap(particles.position)), *others]
+        recorded = torch.is_grad_enabled() and any(column.requires_grad for column in particles.columns().values())
         away = (self.neighborhood.outdated(particles) if self.neighborhood is not None
                 else farthest_outside(self.decomposition, particles) > 0)
         if recorded or not away:
-            return particles, companions
-        prefix = "companion "
-        named = {prefix + name: column for name, column in companions.items()}
+            return states
+
+        def label(number: int, name: str) -> str:
+            return f"{name} {number}" if number and name != "id" else name
+
+        columns = {label(number, name): column for number, state in enumerate(states)
+                   for name, column in state.columns().items()}
         reach = self.model.flow.cutoff if self.neighborhood else self.decomposition.spacing
-        moved = at_home(self.decomposition, {**columns, **named}, reach)
-        return (ParticleSet(**{name: moved[name] for name in columns}),
-                {name: moved[prefix + name] for name in companions})
+        moved = at_home(self.decomposition, columns, reach)
+        return [ParticleSet(**{name: moved[label(number, name)] for name in state.columns()})
+                for number, state in enumerate(states)]
 
     def rates(self, particles: ParticleSet, rows: Tensor | None = None, kept: Mapping[str, LinearRates] | None = None,
               density: Tensor | None = None, time: float | None = None) -> Rates:

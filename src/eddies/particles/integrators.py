@@ -34,7 +34,7 @@ class Integrator:
     def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:
         """Move particles to the ranks of their slabs between two steps; return them and their rates. Collective."""
         if particles is not self._last or not self.memory:
-            particles, _ = self.dynamics.settle(particles)
+            [particles] = self.dynamics.settle(particles)
             self.restore(particles, _remembered(self.dynamics.rates_after(0.0, particles)))
         return particles, Rates(**self.memory)
 
@@ -57,7 +57,7 @@ class VelocityVerlet(Integrator):
     def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:
         """As `Integrator.rates`, but evaluate the rates again: `memory` holds the rates at a predicted velocity."""
         if particles is not self._last:  # the last particles are on their ranks already
-            particles, _ = self.dynamics.settle(particles)
+            [particles] = self.dynamics.settle(particles)
         return particles, self.dynamics.rates(particles, time=self.dynamics.time)
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
@@ -105,23 +105,12 @@ class RungeKutta(Integrator):
         for number, (node, weight) in enumerate(zip(self.scheme.nodes, self.scheme.weights)):
             if number:
                 stage = _advanced(start, stage, rates, node * time_step)
-                stage, start, end = self._settled(stage, start, end)
+                stage, start, end = self.dynamics.settle(stage, start, end)
                 rates = self.dynamics.rates_after(node * time_step, stage)
             end = _advanced(end, stage, rates, weight * time_step)
         self.dynamics.time += time_step
         self.restore(end, {})
         return end
-
-    def _settled(self, stage: ParticleSet, *others: ParticleSet) -> list[ParticleSet]:
-        """Move the particles of a stage to the ranks of their slabs, and move their rows of `others` with them."""
-        companions = {f"{number} {name}": column for number, other in enumerate(others)
-                      for name, column in other.columns().items() if name != "id"}
-        stage, moved = self.dynamics.settle(stage, companions)
-        columns: list[dict[str, Tensor]] = [{"id": stage.id} for _ in others]
-        for label, column in moved.items():
-            number, name = label.split(" ", 1)
-            columns[int(number)][name] = column
-        return [stage, *(ParticleSet(**each) for each in columns)]
 
 
 #: Integrators by their names in scenes.
@@ -136,11 +125,9 @@ def _kick_drift_kick(dynamics: ParticleDynamics, particles: ParticleSet, start: 
     """Particles a step later, and the rates at their predicted velocity and density; collective."""
     position = particles.position + time_step * (_pace(particles, start) + 0.5 * time_step * start.velocity_rate)
     predicted = replace(_kicked(particles, start, time_step), position=position)
-    kicked = _kicked(particles, start, 0.5 * time_step)
-    columns = {name: column for name, column in kicked.columns().items() if name not in ("id", "position")}
-    predicted, columns = dynamics.settle(predicted, columns)
+    predicted, kicked = dynamics.settle(predicted, _kicked(particles, start, 0.5 * time_step))
     end = dynamics.rates_after(time_step, predicted)
-    return _kicked(replace(predicted, **columns), end, 0.5 * time_step), end
+    return _kicked(replace(kicked, position=predicted.position), end, 0.5 * time_step), end
 
 
 def _remembered(rates: Rates) -> dict[str, Tensor]:

@@ -123,7 +123,7 @@ class ParticleRun:
             particles = self.particles
         else:
             columns = between(self._before, self._now(), time, self.dynamics.box).to_numpy()
-            particles, _ = self.dynamics.settle(particles_for(self.model, columns, self.particles.id.device))
+            [particles] = self.dynamics.settle(particles_for(self.model, columns, self.particles.id.device))
             rates = self.dynamics.rates(particles, time=time)
         if rates.density is not None:
             particles = replace(particles, density=rates.density)
