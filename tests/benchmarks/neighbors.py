@@ -10,19 +10,18 @@ come in compressed rows. All are in double precision and on one thread. Prints a
 import argparse
 import json
 import math
-import time
 from collections.abc import Callable
 from importlib.metadata import version
-from statistics import median
 
 import numpy as np
 import torch
 import vesin
+from step import in_turn
 
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.periodic_box import PeriodicBox
 
-LENGTH, REPEATS = 2 * math.pi, 9
+LENGTH = 2 * math.pi
 
 
 def rows(points: torch.Tensor, cutoff: float) -> tuple[np.ndarray, np.ndarray]:
@@ -51,13 +50,7 @@ def main() -> None:
     first, second = (index.astype(np.int64) for index in actions["vesin"]())
     if not np.array_equal(ours, np.sort(first * len(position) + second)):
         raise SystemExit("neighbors: the lists differ")
-    seconds: dict[str, list[float]] = {name: [] for name in actions}
-    for _ in range(REPEATS):  # in turn, so that all meet the same disturbances
-        for name, action in actions.items():
-            start = time.perf_counter()
-            action()
-            seconds[name].append(time.perf_counter() - start)
-    middle = {name: median(times) for name, times in seconds.items()}
+    middle = in_turn(actions)
     print(json.dumps({"points": options.side, "neighbors": len(senders) / len(position), "vesin": version("vesin"),
                       "seconds": middle, "nanoseconds_per_pair": 1e9 * middle["eddies"] / len(senders),
                       "ratio": {"vesin": middle["vesin"] / middle["eddies"]}}))

@@ -22,7 +22,7 @@ import torch
 from mpi4py import MPI
 from step import Stopwatch
 
-from eddies.flow.initial_fields import random_velocity
+from eddies.flow.initial_fields import velocity_of_spectrum
 from eddies.flow.statistics import energy_spectrum, turbulence_scales
 from eddies.flow.tracers import release
 from eddies.cores import threads
@@ -40,7 +40,7 @@ from eddies.particles.neighborhood import Neighborhood
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.scene.sections import Tracers
-from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS
+from eddies.scene.terms import PRESETS, TERMS
 from eddies.spectral.interpolation import SplineInterpolation
 from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid
@@ -62,13 +62,10 @@ PARTS = {
 
 def filtered_velocity(comm: MPI.Comm, side: int, width: float) -> tuple[SpectralGrid, np.ndarray]:
     """A grid of two cells per particle and direction, and filtered modes; rms 1 per component before the filter."""
-    grid = SpectralGrid(SlabDecomposition(comm, 2 * math.pi, 2 * side), cutoff=side - 1)
-    modes = random_velocity(grid, 1, 1.0, side)
-    k, energy = energy_spectrum(grid, modes)
+    grid, k = SpectralGrid(SlabDecomposition(comm, 2 * math.pi, 2 * side), cutoff=side - 1), np.arange(1.0, side)
     # With the dissipation range of a simulation with k_max eta = ETA (Pope 2000, beta = 5.2).
-    target = np.where((k > 0) & (k < side), np.maximum(k, 1) ** (-5 / 3) * np.exp(-5.2 * ETA * k / side), 0.0)
-    shares = np.sqrt(np.divide(1.5 * target / target.sum(), energy, out=np.zeros(len(k)), where=energy > 0))
-    modes *= shares[np.rint(np.sqrt(grid.index_squared)).astype(int)]
+    energy = k ** (-5 / 3) * np.exp(-5.2 * ETA * k / side)
+    modes = velocity_of_spectrum(grid, 1, k, 1.5 * energy / energy.sum())
     return grid, gaussian_transfer(grid.wavenumber_squared, width) * modes
 
 
@@ -83,7 +80,9 @@ class Run:
         self.speed, self.turnover = scales["velocity_rms"], scales["eddy_turnover_time"]
         slab = SlabDecomposition(comm, 2 * math.pi, tracers.planes)
         columns = release(slab, 1, side**3, "random")
-        columns["velocity"] = self._velocity(grid, modes, columns["position"])
+        # The slabs of particles and field have different boundaries.
+        spline = SplineInterpolation(grid, "quintic", margin=2)
+        columns["velocity"] = spline.at(spline.coefficients(modes), columns["position"])
         self.particles = ParticleSet.from_numpy(columns)
         flow = FlowUnits(ReferenceScales(filter_width=width, spacing=tracers.spacing, velocity=self.speed,
                                          acceleration=self.speed / self.turnover, density_mean=1.0, density=1e-3,
@@ -98,18 +97,10 @@ class Run:
         self.dynamics = ParticleDynamics(slab, built, 0.0, dtype)
         self.integrator = INTEGRATORS[INTEGRATOR](self.dynamics)
 
-    @staticmethod
-    def _velocity(grid: SpectralGrid, modes: np.ndarray, position: np.ndarray) -> np.ndarray:
-        # The slabs of particles and field have different boundaries.
-        spline = SplineInterpolation(grid, "quintic", margin=2)
-        return spline.at(spline.coefficients(modes), position)
-
     @property
     def step(self) -> float:
         """The longest step that the flow allows."""
         resolution = self.dynamics.resolution
-        if resolution is None:
-            raise SystemExit("particle_step: the model has no resolved velocity, which sets the step")
         highest = resolution.grid.resolved * 2 * math.pi / self.dynamics.box.length
         return allowed_step(self.integrator.scheme.angle, highest, resolution.speed or self.speed)
 
@@ -147,7 +138,7 @@ def measure(comm: MPI.Comm, run: Run) -> dict[str, object]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("side", nargs="?", type=int, default=64)
-    parser.add_argument("--model", choices=[name for name in PRESETS if "resolved" in name], default=DEFAULT_PRESET)
+    parser.add_argument("--model", choices=[name for name in PRESETS if "resolved" in name], default="resolved")
     parser.add_argument("--threads", type=int, default=threads(), help="per rank; default OMP_NUM_THREADS")
     parser.add_argument("--precision", choices=("float32", "float64"), default="float32")
     options, comm = parser.parse_args(), MPI.COMM_WORLD

@@ -7,8 +7,8 @@ FINUFFT (pip install --no-binary finufft finufft, to build it for this processor
 precision, measured plans that are used again, and the fastest of several grids and of three or two transforms at once;
 the first of two holds two components as real and imaginary part. Its time excludes this packing and the additional
 modes kx < 0 that it needs. The velocity has the spectrum that the closure expects (`ResolvedVelocity`). Errors are
-relative to exact sums at some points and in some modes, weighted by that spectrum. FINUFFT's tolerance is 1e-3, or the
-largest with an error not above that of the splines.
+relative to exact sums at some points and in some modes, weighted by that spectrum. FINUFFT's tolerance is the largest
+with an error not above that of the splines.
 
 Prints JSON lines with median seconds: "interpolation" from modes to points, "spreading" from points to modes, each as a
 whole and between grid and points alone (FINUFFT's `spreadinterponly` with the same grid and tolerance).
@@ -17,22 +17,21 @@ whole and between grid and points alone (FINUFFT's `spreadinterponly` with the s
 import argparse
 import json
 import math
-import time
 from collections.abc import Callable
-from statistics import median
 
 import finufft
 import numpy as np
 import torch
 from mpi4py import MPI
+from step import in_turn
 
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.resolved_velocity import ResolvedVelocity
 
-PLANES, HIGHEST, REPEATS, CHECKED = 1.75, 0.75, 9, 100
+PLANES, HIGHEST, CHECKED = 1.75, 0.75, 100
 UPSAMPLING = (1.15, 1.23, 1.25)  # the first is the least that FINUFFT allows; 2, its other standard, takes far longer
-TOLERANCES, TOLERANCE = [10 ** (-i / 6) for i in range(6, 30)], 1e-3
+TOLERANCES = [10 ** (-i / 6) for i in range(6, 30)]
 MEASURE = 0                      # FFTW's flag
 
 Action = Callable[[], np.ndarray]
@@ -150,31 +149,19 @@ def _fine(least: float) -> int:
     return next(n for n in range(2 * math.ceil(least / 2), 2 * math.ceil(least), 2) if 30**20 % n == 0)
 
 
-def medians(actions: dict[str, Action]) -> dict[str, float]:
-    """Median seconds of each action, measured in turn."""
-    seconds: dict[str, list[float]] = {name: [] for name in actions}
-    for _ in range(REPEATS + 1):
-        for name, action in actions.items():
-            start = time.perf_counter()
-            action()
-            seconds[name].append(time.perf_counter() - start)
-    return {name: median(taken[1:]) for name, taken in seconds.items()}
-
-
 def compare(case: Case, threads: int, name: str) -> list[dict[str, object]]:
     """Interpolation or spreading by both, with the fastest of FINUFFT's forms."""
     whole, part = ours(case)[name]
     error = case.error(name, whole())
     actions, parts, errors = {"eddies": whole}, {"eddies": part}, {"eddies": error}
     for form in (Peer(case, threads, name, packed, factor) for packed in (False, True) for factor in UPSAMPLING):
-        same = next(tolerance for tolerance in TOLERANCES if form.error(form.whole(tolerance)()) <= error)
-        for what, tolerance in (("same error", same), (f"{TOLERANCE:g}", TOLERANCE)):
-            label = f"finufft, {what}: {tolerance:g}, grid of {form.upsampling}, {len(form.given)} transforms"
-            actions[label], parts[label] = form.whole(tolerance), form.part(tolerance)
-            errors[label] = form.error(actions[label]())
-    both = medians(actions | {f"part {label}": action for label, action in parts.items()})
+        tolerance = next(tolerance for tolerance in TOLERANCES if form.error(form.whole(tolerance)()) <= error)
+        label = f"finufft: tolerance {tolerance:g}, grid of {form.upsampling}, {len(form.given)} transforms"
+        actions[label], parts[label] = form.whole(tolerance), form.part(tolerance)
+        errors[label] = form.error(actions[label]())
+    both = in_turn(actions | {f"part {label}": action for label, action in parts.items()})
     found, count = [], len(case.position)
-    for who in ("eddies", "finufft, same error", f"finufft, {TOLERANCE:g}"):
+    for who in ("eddies", "finufft"):
         labels = [label for label in actions if label.startswith(who)]
         best, alone = (min(labels, key=lambda label: both[part + label]) for part in ("", "part "))
         found.append({"by": best, "error": errors[best], "seconds": both[best],

@@ -121,6 +121,17 @@ def best(action: Callable[[], object], repeats: int = 7) -> float:
     return min(times)
 
 
+def in_turn(actions: dict[str, Callable[[], object]], rounds: int = 9) -> dict[str, float]:
+    """Median seconds of each action. They are measured in turn, so that all meet the same disturbances."""
+    seconds: dict[str, list[float]] = {name: [] for name in actions}
+    for _ in range(rounds + 1):
+        for name, action in actions.items():
+            start = time.perf_counter()
+            action()
+            seconds[name].append(time.perf_counter() - start)
+    return {name: median(times[1:]) for name, times in seconds.items()}  # the first call also fills caches
+
+
 def triad_bandwidth(size: int) -> float:
     """Bytes per second that a rank reads and writes in a = b + c with arrays of `size` bytes."""
     a, b, c = np.ones((3, size // 8))

@@ -7,18 +7,15 @@ to zero between the two transforms. Its plans are measured, its default. Ours dr
 """
 
 import sys
-import time
 from collections.abc import Callable
-from statistics import median
 
 import numpy as np
 from mpi4py import MPI
 from mpi4py_fft import PFFT, newDistArray
+from step import in_turn
 
 from eddies.parallel.slab import SlabDecomposition
 from eddies.spectral.spectral_grid import SpectralGrid
-
-REPEATS = 15
 
 
 def peer_transform(comm: MPI.Comm, grid: SpectralGrid, field: np.ndarray) -> Callable[[], np.ndarray]:
@@ -52,18 +49,11 @@ def main() -> None:
                            "mpi4py-fft": peer_transform(comm, grid, field)}
             ours, theirs = (round_trip() for round_trip in round_trips.values())
             difference = comm.allreduce(float(np.abs(ours - theirs).max()), MPI.MAX)
-            seconds = {name: [] for name in round_trips}
-            for _ in range(REPEATS):  # in turn, so that both meet the same disturbances
-                for name, round_trip in round_trips.items():
-                    comm.Barrier()
-                    start = time.perf_counter()
-                    round_trip()
-                    comm.Barrier()
-                    seconds[name].append(time.perf_counter() - start)
+            middle = in_turn({name: lambda round_trip=round_trip: (round_trip(), comm.Barrier())
+                              for name, round_trip in round_trips.items()}, rounds=15)
             if comm.rank == 0:
-                middle = {name: 1e3 * median(times) for name, times in seconds.items()}
                 print(f"{cells:4}^3  {precision}  {comm.size} ranks  "
-                      + "  ".join(f"{name} {value:.1f} ms" for name, value in middle.items())
+                      + "  ".join(f"{name} {1e3 * value:.1f} ms" for name, value in middle.items())
                       + f"  ratio {middle['mpi4py-fft'] / middle['eddies']:.2f}  difference {difference:.0e}",
                       flush=True)
 

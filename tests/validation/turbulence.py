@@ -3,12 +3,10 @@
     python tests/validation/turbulence.py runs/hit=0.08 RUN=M_T ... [--output runs/validation]
 
 Reads the ground_truth.h5 of runs, each with its nominal M_t, whose scenes have [spin_up] stationary (hit, hit-mt004,
-hit-mt008, hit-mt016), prints a table of their averages beside the literature's values, and writes turbulence.json and
-turbulence.png.
+hit-mt008, hit-mt016), prints a table of their averages beside the literature's values, and writes turbulence.png.
 """
 
 import argparse
-import json
 from itertools import cycle
 from pathlib import Path
 
@@ -20,7 +18,7 @@ from eddies.analysis.isotropic_turbulence import Row, comparison
 from eddies.io.hdf5 import open_product
 from eddies.report.figures import DNS, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled
 from eddies.report.page import shown
-from eddies.report.stationary import columns_of, draw_compensated
+from eddies.report.stationary import draw_compensated
 from eddies.workflows.report import read_stationary_span
 
 NOMINAL = (0.04, 0.08, 0.16)  # turbulent Mach numbers of the paper's Table 1
@@ -45,13 +43,6 @@ class Run:
         self.density_rms = self.span.mean("density_rms")
         self.compressible_fraction = self.span.mean("compressible_fraction")
         self.compressible_velocity = np.sqrt(self.compressible_fraction)
-
-    def numbers(self) -> dict:
-        """Everything as it goes into the JSON file."""
-        k_eta, compensated = self.span.compensated_spectrum()
-        return {"nominal_mach": self.nominal, "mach_off_by": self.mach / self.nominal - 1,
-                "density_rms": self.density_rms, **{key: columns_of(row) for key, row in self.rows.items()},
-                "spectrum": {"k_eta": k_eta.tolist(), "compensated": compensated.tolist()}}
 
 
 def scaling(runs: list[Run]) -> dict[str, float]:
@@ -131,15 +122,12 @@ def main() -> None:
     parser.add_argument("--output", default="runs/validation", metavar="DIR")
     options = parser.parse_args()
     runs, output = [Run(directory) for directory in options.runs], Path(options.output)
-    numbers = {"runs": {run.name: run.numbers() for run in runs}}
-    if len({run.nominal for run in runs}) > 1:
-        numbers["scaling"] = scaling(runs)
     output.mkdir(parents=True, exist_ok=True)
-    (output / "turbulence.json").write_text(json.dumps(numbers, indent=1, allow_nan=False) + "\n")
     draw(runs).savefig(output / "turbulence.png", dpi=100, facecolor="white")
     print(table(runs))
-    for name, value in numbers.get("scaling", {}).items():
-        print(f"{name}: {shown(value)}")
+    if len({run.nominal for run in runs}) > 1:
+        for name, value in scaling(runs).items():
+            print(f"{name}: {shown(value)}")
 
 
 if __name__ == "__main__":
