@@ -6,6 +6,7 @@ import pytest
 
 import eddies
 from eddies.io import datasets
+from eddies.io.checksums import open_to_read
 from eddies.io.fields import FieldWriter
 from eddies.io.hdf5 import create_product
 from tests.left_out import leave_out_figures
@@ -29,7 +30,7 @@ def test_groups_are_datasets_that_are_read_on_access(directory):
     assert list(model["xyz"].values) == ["x", "y", "z"] and model["time"].attrs["units"] == "T"
     # Values are those of the file for any order of indices, and nothing is read before.
     assert not model["velocity"].variable._in_memory
-    with datasets.opened(directory / "rollout.h5") as file:
+    with open_to_read(directory / "rollout.h5") as file:
         whole = file["particles/model/velocity/value"][()]
     chosen = model["velocity"].isel(time=-1, particle=[5, 2, 2])
     assert np.array_equal(chosen, whole[-1, [5, 2, 2]])

@@ -48,10 +48,11 @@ class StoredRun:
     @property
     def groups(self) -> list[str]:
         """Names for `run[...]`, such as "rollout/particles/model"."""
-        from eddies.io.datasets import groups_in, opened
+        from eddies.io.checksums import open_to_read
+        from eddies.io.datasets import groups_in
         found = []
         for product in self.products:
-            with opened(self.path / self._files[product]) as file:
+            with open_to_read(self.path / self._files[product]) as file:
                 found += [f"{product}/{group}" for group in groups_in(file)]
         return found + [name for name in MADE if name not in found and "rollout" in self.products]
 

@@ -7,7 +7,6 @@ may belong to a checkpoint, which then stores their checksums.
 
 from __future__ import annotations
 
-import errno
 import json
 import logging
 import math
@@ -26,7 +25,7 @@ from mpi4py import MPI
 
 from eddies.cores import threads
 from eddies.io.checksums import find_damage, open_to_read, table_checksum
-from eddies.io.errors import WriteError, read_error
+from eddies.io.errors import ContentError, ProductError, WriteError, read_errors
 from eddies.io.frame_segments import FrameSegments
 from eddies.io.hdf5 import in_files, write_block
 from eddies.io.new_files import HEADER_BYTES, new_file, own_part, writing
@@ -223,12 +222,13 @@ def _step_of(path: Path) -> int:
 def _content(path: Path) -> dict[str, Any] | None:
     """The content of a checkpoint; None if it is damaged. Raises ProductError if the system refuses to read it."""
     try:
-        return {"step": _step_of(path), "format": 0} if path.is_dir() else Checkpoint(path).content
-    except OSError as error:
-        if error.errno not in (None, errno.ENOENT):
-            raise read_error(path, error) from None
+        with read_errors(path):
+            return {"step": _step_of(path), "format": 0} if path.is_dir() else Checkpoint(path).content
+    except ContentError:
         return None
-    except (ValueError, KeyError, RuntimeError):  # ProductError is a RuntimeError
+    except ProductError:
+        raise
+    except (ValueError, KeyError, RuntimeError):
         return None
 
 

@@ -12,15 +12,15 @@ import itertools
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
 
-from eddies.io.errors import ProductError, file_errors, read_error, remedy_for
+from eddies.io.errors import ContentError, ProductError, file_errors, read_errors, remedy_for
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -43,18 +43,19 @@ def open_to_read(path: str | Path) -> h5py.File:
     directory has a lock, and a product gets its name only when it is complete.
 
     Raises:
-        OSError: the file cannot be opened, or its checksums are missing.
-        ProductError: bytes differ from their checksums, when the file is opened or at a later read.
+        ContentError: it is no HDF5 file, its checksums are missing, or bytes differ from them; also at a later read.
+        ProductError: the system refuses to open the file.
     """
-    with _opened(path) as descriptor:
-        checked = _covered_bytes(descriptor) is not None
-    if checked:
-        return h5py.File(CheckedFile(path), "r")
-    file = h5py.File(path, "r", locking=False)
-    if ATTRIBUTE in file.attrs:
-        file.close()
-        raise OSError(MISSING)
-    return file
+    with read_errors(path):
+        with _opened(path) as descriptor:
+            checked = _covered_bytes(descriptor) is not None
+        if checked:
+            return h5py.File(CheckedFile(path), "r")
+        file = h5py.File(path, "r", locking=False)
+        if ATTRIBUTE in file.attrs:
+            file.close()
+            raise OSError(MISSING)
+        return file
 
 
 class CheckedFile:
@@ -83,7 +84,7 @@ class CheckedFile:
         return self._at
 
     def readinto(self, buffer: memoryview) -> int:
-        """Fill a buffer with the bytes from the position on. ProductError if bytes differ from their checksums."""
+        """Fill a buffer with the bytes from the position on. ContentError if bytes differ from their checksums."""
         done, size = 0, min(len(buffer), self._size - self._at)
         while done < size:
             first, skipped = divmod(self._at + done, BLOCK_BYTES)
@@ -91,7 +92,7 @@ class CheckedFile:
             wrong = _first_wrong(self._descriptor, first, part, self._size, skipped)
             if wrong is not None:
                 words = _damage(self.path, wrong, self._naming)
-                raise ProductError(f"{words}; {remedy_for(self.path.stem)}")
+                raise ContentError(f"{words}; {remedy_for(self.path.stem)}")
             done += len(part)
         return done
 
@@ -141,6 +142,7 @@ def find_damage(comm: MPI.Comm, path: Path, known: int | None = None) -> str | N
     from eddies.parallel.broadcast import on_all_ranks, on_first_rank
     from eddies.parallel.reduction import global_min
 
+    @read_errors(path)
     def look() -> int | str:
         if not path.is_file():
             return f"{path}: missing"
@@ -150,22 +152,18 @@ def find_damage(comm: MPI.Comm, path: Path, known: int | None = None) -> str | N
             return f"{path}: is not the file that was written, its checksums are different"
         return f"{path}: {MISSING}" if size is None else size
 
+    @read_errors(path)
     def first_wrong() -> int:
         with _opened(path) as descriptor:
             wrong = (_first_wrong(descriptor, first, part, size) for first, part in _own_pieces(comm, size))
             return next((block for block in wrong if block is not None), _count_blocks(size))
 
-    def reading(action: Callable[[], Any]) -> Any:
-        try:
-            return action()
-        except OSError as error:
-            raise read_error(path, error) or ProductError(f"{path}: cannot be read ({error})") from None
-
-    size = on_first_rank(comm, lambda: reading(look))
+    size = on_first_rank(comm, look)
     if isinstance(size, str):
         return size
-    block = int(global_min(comm, on_all_ranks(comm, lambda: reading(first_wrong), ProductError)))
-    return on_first_rank(comm, lambda: reading(lambda: _damage(path, block))) if block < _count_blocks(size) else None
+    block = int(global_min(comm, on_all_ranks(comm, first_wrong, ProductError)))
+    with read_errors(path):
+        return on_first_rank(comm, lambda: _damage(path, block)) if block < _count_blocks(size) else None
 
 
 @contextmanager
@@ -242,7 +240,7 @@ def _place(path: Path, start: int, stop: int) -> str:
     try:
         with h5py.File(CheckedFile(path, naming=False), "r") as file:
             file.visititems(look)
-    except ProductError:  # HDF5 needs the damaged bytes to find the datasets
+    except ContentError:  # HDF5 needs the damaged bytes to find the datasets
         names.append("the structure of the file, or data beside it")
     return " or ".join(names[:NAMED]) or "the structure of the file"
 

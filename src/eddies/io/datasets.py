@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 
 from eddies.io.checksums import open_to_read
-from eddies.io.errors import ProductError, read_error, remedy_for
+from eddies.io.errors import ProductError
 from eddies.io.quantities import dataset_attributes, python_value
 
 try:
@@ -67,10 +67,10 @@ def open_group(path: Path, name: str) -> Any:
     ProductError if there is no such group or file.
     """
     def read(array: str, key: tuple) -> np.ndarray:
-        with opened(path) as file:
+        with open_to_read(path) as file:
             return np.asarray(file[array][key])
 
-    with opened(path) as file:
+    with open_to_read(path) as file:
         group = file.get(name)
         if not isinstance(group, h5py.Group):
             raise ProductError(f"{path}: holds no {name}; it holds: {', '.join(groups_in(file))}")
@@ -101,15 +101,6 @@ def groups_in(file: h5py.File) -> list[str]:
 
     file.visititems(look)
     return names
-
-
-def opened(path: Path) -> h5py.File:
-    """Open a product in one process; ProductError if it cannot be opened."""
-    try:
-        return open_to_read(path)
-    except OSError as error:
-        raise read_error(path, error) or ProductError(
-            f"{path}: cannot be opened ({error}); {remedy_for(path.stem)}") from None
 
 
 def _dataset(arrays: Mapping[str, tuple[Any, Callable[[tuple], np.ndarray]]], attributes: Mapping[str, Any]) -> Any:

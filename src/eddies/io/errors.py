@@ -19,6 +19,10 @@ class ProductError(UserError, RuntimeError):
     """A product is missing, unfinished, damaged or of the wrong kind."""
 
 
+class ContentError(ProductError):
+    """The content of a file is damaged, of another format, or gone. After other errors the file may be sound."""
+
+
 class WriteError(ProductError):
     """A file cannot be written. All ranks that write it raise this error at the same place, so they can close and
     remove files together."""
@@ -51,12 +55,19 @@ def space_in_words(path: Path | str, wanted: int) -> str:
     return f"{wanted} bytes wanted, {free} free" if wanted else f"{free} bytes free"
 
 
-def read_error(path: Path | str, error: OSError) -> ProductError | None:
-    """The error for a file that the system refuses to read; None if HDF5 has found its content damaged."""
-    if error.errno is None:
-        return None
-    return ProductError(f"{path}: cannot be read: {os.strerror(error.errno)}; check its permissions, its directory and "
-                        "the file system, or give another path")
+@contextmanager
+def read_errors(path: Path | str) -> Iterator[None]:
+    """Convert an OSError inside the block: to ContentError if HDF5 has found the content damaged or the file is
+    missing, and else to ProductError, because the system refuses to read the file."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None:
+            raise ContentError(f"{path}: damaged or not an HDF5 file ({error}); make or get it again, or give "
+                               "another file") from None
+        kind = ContentError if error.errno == errno.ENOENT else ProductError
+        raise kind(f"{path}: cannot be read: {os.strerror(error.errno)}; check its permissions, its directory and the "
+                   "file system, or give another path") from None
 
 
 def remedy_for(kind: str, file: str = "it") -> str:

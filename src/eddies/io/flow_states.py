@@ -25,7 +25,7 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.io.checksums import open_to_read
-from eddies.io.errors import ProductError, read_error
+from eddies.io.errors import ContentError, ProductError, read_errors
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import open_product
 from eddies.io.provenance import read_provenance
@@ -134,14 +134,13 @@ def _is_product(path: Path) -> bool:
 def _open(path: Path) -> h5py.File:
     try:
         return open_to_read(path)
-    except OSError as error:
-        if problem := read_error(path, error):
-            raise problem from None
+    except ContentError:
         with open(path, "rb") as file:
             start = file.read(max(map(len, OTHER_FORMATS)))
         found = next((text for mark, text in OTHER_FORMATS.items() if start.startswith(mark)), None)
-        raise ProductError(f"{path}: is {found}" if found else
-                           f"{path}: is not an HDF5 file, or is damaged ({error}); get or make it again") from None
+        if found is None:
+            raise
+        raise ProductError(f"{path}: is {found}") from None
 
 
 def _velocity_cubes(file: h5py.File) -> VelocityCubes:
@@ -235,10 +234,8 @@ def read_spectrum(path: Path) -> tuple[np.ndarray, np.ndarray]:
     One rank calls it. Raises ProductError if the file holds something else.
     """
     try:
-        with warnings.catch_warnings(action="ignore"):  # numpy warns of an empty file
-            table = np.loadtxt(path, ndmin=2, encoding="utf-8")
-    except OSError as error:
-        raise read_error(path, error) or ProductError(f"{path}: cannot be read") from None
+        with read_errors(path), warnings.catch_warnings(action="ignore"):  # numpy warns of an empty file
+            table = np.loadtxt(path.read_text(encoding="utf-8").splitlines(), ndmin=2)
     except ValueError as error:
         raise ProductError(f"{path}: holds no spectrum ({error}); write a wavenumber and E(k) in each line") from None
     if table.shape[1] != 2 or not np.isfinite(table).all():

@@ -15,7 +15,7 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.io.checksums import ATTRIBUTE, WORDS, open_to_read
-from eddies.io.errors import ProductError, file_errors, read_error, remedy_for
+from eddies.io.errors import ProductError, file_errors, read_errors, remedy_for
 from eddies.io.new_files import HEADER_BYTES, frame_bytes, new_file, own_part, writing
 from eddies.io.provenance import FORMAT, environment, has_this_format, identity, read_json, read_provenance
 from eddies.io.quantities import conventions, describe, python_value
@@ -203,15 +203,12 @@ def unfit(dataset: h5py.Dataset, problem: str) -> ProductError:
 
 def _open_checked(path: Path, kind: str | None) -> h5py.File:
     remedy = f"run `eddies {MAKER_OF[kind].name} SCENE` first" if kind in MAKER_OF else "make it first"
-    try:
+    with read_errors(path):
         if path.is_dir():
             raise ProductError(f"{path}: is a directory, not a file; move it away, then {remedy}")
         if not path.is_file():
             raise ProductError(f"{path}: no such file; {remedy}")
         file = open_to_read(path)
-    except OSError as error:
-        raise read_error(path, error) or ProductError(
-            f"{path}: damaged or not an HDF5 file ({error}); make it again, or give another file") from None
     try:
         if problem := _problem(file, kind, remedy):
             raise ProductError(f"{path}: {problem}")

@@ -69,7 +69,7 @@ def before_checksums(path: Path) -> bool:
     try:
         with open_to_read(path) as file:
             return ATTRIBUTE not in file.attrs
-    except (OSError, ProductError):
+    except ProductError:
         return False
 
 
