@@ -212,7 +212,7 @@ def check_inputs(step: Step, comm: Comm, made: Collection[Path] = ()) -> None:
     if weights is not None and weights not in made:
         read_source(scene, comm)
     for needed in scene.inputs(stages[0]):
-        holder = step.holder(needed.name)
+        holder = step.links.get(needed.name, step.directory)
         if holder / needed.file in made:
             continue
         with open_product(comm, holder / needed.file, needed.product):

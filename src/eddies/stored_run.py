@@ -186,7 +186,7 @@ def variant_directory(path: Path, name: str) -> Path:
     from eddies.workflows.variants import rollouts
     scene = load_scene(path / "scene.toml")
     scene.check_variants([name])
-    return rollouts(scene, path)[name][0].directory
+    return next(iter(rollouts(scene, path)[name]))
 
 
 def chosen(table: dict[str, Any], of: str) -> Any:

@@ -10,8 +10,8 @@ from eddies.io.weights import save_weights
 from eddies.measures import MEASURES
 from eddies.scene.scene import load_scene
 from eddies.workflows.variant_rows import (BEFORE, BREAK_EVEN, SEARCH, THROUGH_KERNEL, add_break_even, before, combined,
-                                           missing_reason, notes, row, simulation_seconds, step_costs)
-from eddies.workflows.variants import RolloutRun
+                                           leave_out_kernel, missing_reason, notes, row, simulation_seconds, step_costs,
+                                           with_another_kernel)
 from tests.small_scene import TINY
 
 HEAD = f'base = "{TINY}"\nsimulation.turnovers = 0.25\nkernel.steps = 50\n'
@@ -46,17 +46,19 @@ def test_one_realisation_that_stops_leaves_no_number():
 @pytest.mark.parametrize("change", ["kernel.neighbors = 40", "kernel.steps = 60"])
 def test_numbers_of_another_kernel_are_left_out(tmp_path, change):
     scene = scene_of(tmp_path, ("smaller", "model.pairs.hidden = [8]", "simulation.step = 0.05"), ("own", change))
-    for name, variant in scene.variant.items():
-        found = row(scene, name, [RolloutRun(variant, tmp_path)], [REALISED], None)
-        blank = {measure for measure in MEASURES if found[measure] is None}
-        assert blank == (set(THROUGH_KERNEL) if name == "own" else set())
-    _, note = notes(scene)
+    rows = [row(scene, name, [tmp_path], [REALISED], None) for name in scene.variant]
+    another = with_another_kernel(scene)
+    assert another == ["own"]
+    leave_out_kernel(rows, another)
+    assert [{measure for measure in MEASURES if found[measure] is None} for found in rows] == [
+        set(), set(), set(THROUGH_KERNEL)]
+    _, note = notes((), another, {}, {})
     assert note.startswith("own: no ") and all(MEASURES[name] in note for name in THROUGH_KERNEL)
 
 
 def test_a_variant_without_a_rollout_says_why(tmp_path):
     scene = scene_of(tmp_path)
-    assert row(scene, "plain", [RolloutRun(scene.variant["plain"], tmp_path)], [], None)["status"] == "not run"
+    assert row(scene, "plain", [tmp_path], [], None)["status"] == "not run"
     (tmp_path / "failure.txt").write_text("too few slabs\n")
     assert missing_reason(tmp_path) == missing_reason(tmp_path / "realisation-2") == "failed: too few slabs"
 
@@ -68,20 +70,18 @@ def test_a_turnover_costs_as_much_as_its_steps():
     assert found["core_seconds"] == pytest.approx(18.0)
 
 
-def test_a_note_says_how_many_flows_the_numbers_are_of(tmp_path):
-    none = ("none", 'simulation.method = "none"')
-    (one,) = notes(scene_of(tmp_path, none))
-    assert "one realisation" in one
-    (several,) = notes(scene_of(tmp_path, none, head="realisations = [2, 5]\n"))
-    assert "2 realisations, seeds 2, 5" in several
+def test_a_note_says_how_many_flows_the_numbers_are_of():
+    (one,), (several,) = notes((), [], {}, {}), notes((2, 5), [], {}, {})
+    assert "one realisation" in one and "2 realisations, seeds 2, 5" in several
 
 
-def test_a_note_gives_the_wavenumbers_that_grids_keep(tmp_path):
-    grid = 'simulation.method = "eulerian"'
-    scene = scene_of(tmp_path, ("grid-18", grid, "eulerian.cells = 18"), ("grid-16", grid, "eulerian.cells = 16"),
-                     ("grid", grid))
-    # A grid of 18 cells does not keep the mode 18/3 = 6. By default a grid has 8 cells, the smallest number.
-    assert "5 in grid-18, 5 in grid-16, 2 in grid; the filter wavenumber k_d = pi/d is 3." in notes(scene)[1]
+def test_notes_on_the_wavenumbers_that_grids_keep_and_on_different_particles():
+    tracers = {name: load_scene(TINY).tracers for name in ("grid-18", "grid-16", "plain")}
+    # A grid of 18 cells does not keep the mode 18/3 = 6.
+    _, note = notes((), [], tracers, {"grid-18": 18, "grid-16": 16, "plain": 0})
+    assert "5 in grid-18, 5 in grid-16; the filter wavenumber k_d = pi/d is 3." in note
+    *_, note = notes((), [], tracers | {"few": tracers["plain"].with_count(27)}, {})
+    assert note.startswith("Variants have different particles")
 
 
 @pytest.mark.mpi(1)
@@ -105,13 +105,9 @@ def test_the_cost_of_a_model_is_read_from_its_file(comm, tmp_path, stored):
         assert before(missing, missing, comm) == {}
 
 
-def test_the_direct_simulation_is_timed_with_the_others_where_a_variant_repeats_it(tmp_path):
-    grid = 'simulation.method = "eulerian"'
-    scene = scene_of(tmp_path, ("grid", grid), ("dns", grid, "eulerian.cells = 24"))
-    assert scene.variant["dns"].flow.cells == 24
+def test_the_direct_simulation_is_timed_with_the_others_where_a_variant_repeats_it():
     rows = [{"name": name, "wall_seconds": seconds} for name, seconds in (("plain", 1.0), ("grid", 2.0), ("dns", 5.0))]
-    assert simulation_seconds(scene, rows, 9.0) == 5.0
-    assert simulation_seconds(scene, rows[:2], 9.0) == 9.0
+    assert simulation_seconds(rows, ["dns"], 9.0) == 5.0 and simulation_seconds(rows, [], 9.0) == 9.0
 
 
 def test_a_method_breaks_even_with_the_simulation_and_with_the_cheapest_grid_as_accurate():

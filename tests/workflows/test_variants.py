@@ -40,7 +40,7 @@ UNSEEN = """
 simulation.step = 0.1
 [variant.grid]
 simulation.method = "eulerian"
-eulerian.cells = 12
+eulerian.cells = 16
 """
 
 
@@ -170,7 +170,7 @@ def test_a_variant_in_another_flow_makes_its_own_ground_truth(folder):
     shared = truths[0].read_bytes()
     (folder / "own.toml").write_text(text + "[variant.a]\n[variant.b]\nflow.viscosity = 0.2\n")
     scene = load_scene("own.toml")
-    assert [run.scene.flow.viscosity for (run,) in rollouts(scene, folder).values()] == [0.1, 0.2]
+    assert [own.flow.viscosity for runs in rollouts(scene, folder).values() for own in runs.values()] == [0.1, 0.2]
     assert planned(scene, ("dns", "simulate"))[1] == ("runs/own/b", ("dns",), {})
     assert run_cli("dns", "own.toml") == 0
     assert run_cli("simulate", "own.toml", "--overwrite") == 0
@@ -278,7 +278,9 @@ def test_realisations_that_no_training_has_seen(comm, folder, monkeypatch):
     assert all(np.array_equal(one[name], values) for one in weights for name, values in weights[0].items())
     record, rows = rows_of(out)
     (summary,) = (sentence for sentence in record["summary"] if "the velocity error of" in sentence)
-    assert summary in (out / "report/index.html").read_text() and rows["grid"]["method"] == "eulerian"
+    page = (out / "report/index.html").read_text()
+    assert summary in page and "5 in grid" in page and "seeds 5, 6" in page and rows["grid"]["method"] == "eulerian"
+    assert record["simulation_seconds"] == rows["grid"]["wall_seconds"]  # it has the grid of the direct simulation
     assert rows["learned"]["training_seconds"] > 0 and rows["grid"]["training_seconds"] is None
     for name, row in rows.items():
         assert row["realisations"] == 2 and row["status"] == "complete"

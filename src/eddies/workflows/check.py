@@ -58,7 +58,7 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
     for step in sorted(planned, key=lambda step: [None, *scene.variant].index(step.variant)):
         for stage in step.stages:
             work.setdefault((step.variant, stage), []).append(step.scene)
-    pages = [run.scene for runs in rollouts(scene, scene.directory).values() for run in runs]
+    pages = [each for runs in rollouts(scene, scene.directory).values() for each in runs.values()]
     work[None, "report"] = pages or [scene]
     costs, needs = [], []
     for (variant, stage), scenes in work.items():

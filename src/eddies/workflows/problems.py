@@ -114,7 +114,7 @@ def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
 def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
     """Yield problems: an unstable or decayed flow, too many steps, frames, ranks or bytes, or too few frames."""
     scene, stages, expected = step.scene, step.stages, estimate(step.scene)
-    tracers, turbulence = scene.tracers, expected.turbulence
+    tracers, turbulence, truth = scene.tracers, expected.turbulence, step.links.get("dns", step.directory)
     if "dns" in stages:
         if scene.forcing is not None:
             yield from _strong_forcing(scene.initial, scene.forcing, scene.time)
@@ -129,9 +129,9 @@ def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]
     # No upper limit of the turnover time is known if the flow decays before the tracers start, or is hardly turbulent.
     decays = scene.spin_up is not None and scene.forcing is None
     if tracers is not None and turbulence is not None and turbulence.reynolds_lambda >= TURBULENT and (
-            not decays and step.holder("dns") / STAGES["dns"].file in made):
+            not decays and truth / STAGES["dns"].file in made):
         yield from _too_few_frames(tracers, turbulence.turnover_time, partial(
-            check_frames, stages, tracers, scene.own_training, scene.simulation, scene.seen_in(step.holder("dns"))))
+            check_frames, stages, tracers, scene.own_training, scene.simulation, scene.seen_in(truth)))
     limits = most_ranks(scene.ground_truth_alone if set(stages) == {"dns"} else scene)
     yield from rank_problems(limits, comm.size)
     if has_single_writer(comm):
@@ -239,7 +239,7 @@ def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str
         yield str(error)
     if model is not None and model.path is None and scene.training.truths is not None:
         from eddies.workflows.learned.truths import truth_problems  # imports torch
-        own_file = step.holder("dns") / STAGES["dns"].file
+        own_file = step.links.get("dns", step.directory) / STAGES["dns"].file
         for problem in truth_problems(scene.training, scene.tracers, model.reads, own_file, comm):
             yield f"{scene.name}: {problem}"
 
@@ -269,7 +269,7 @@ def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
             yield from rollout_steps(simulation, allowed, model, StepUnits(
                 radius=scene.interaction_radius, filter_width=tracers.filter_width, sound_speed=scene.flow.sound_speed,
                 velocity=None if speed is None else speed / math.sqrt(3), scheme=simulation.scheme))
-        yield from beyond_truth(simulation, tracers, scene.seen_in(step.holder("dns")))
+        yield from beyond_truth(simulation, tracers, scene.seen_in(step.links.get("dns", step.directory)))
     if "train" in stages and model.path and model.weights_file not in made and not model.weights_file.is_file():
         yield (f'[model] path = "{model.path}": `eddies train` needs {model.weights_file}, which does not exist yet; '
                "train that model first, or give another path")

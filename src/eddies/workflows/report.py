@@ -41,9 +41,9 @@ from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.workflows.problems import directory_problems
 from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite
 from eddies.workflows.run_directory.work import read_stage_seconds
-from eddies.workflows.variant_rows import (COLUMNS, ROLLOUT, add_break_even, machine, notes, numbers, row,
-                                           simulation_seconds)
-from eddies.workflows.variants import RolloutRun, rollouts
+from eddies.workflows.variant_rows import (COLUMNS, ROLLOUT, add_break_even, leave_out_kernel, machine, notes,
+                                           numbers, row, simulation_seconds, with_another_kernel)
+from eddies.workflows.variants import rollouts
 
 if TYPE_CHECKING:
     from eddies.analysis.rollout import Rollout
@@ -100,7 +100,8 @@ class Page:
 
 @dataclass(frozen=True)
 class Run:
-    """A run directory: its scene (None if there is no readable one), the rollouts of its variants, and its pages.
+    """A run directory: its scene (None if there is no readable one), the directories of its variants' rollouts, and its
+    pages.
 
     pages: run directory of each variant that was run, by name; the main page comes first. If no variant has a rollout,
     there is one page, of the run directory itself, under the name "". output: directory of the reports; None: "report"
@@ -109,7 +110,7 @@ class Run:
 
     directory: Path
     scene: Scene | None
-    runs: Mapping[str, Sequence[RolloutRun]]
+    runs: Mapping[str, Sequence[Path]]
     pages: Mapping[str, Path]
     output: Path | None = None
 
@@ -122,8 +123,9 @@ class Run:
             scene = load_scene(directory / "scene.toml")
         if scene is not None:
             scene.check_variants(first)
-            runs = rollouts(scene, directory) if scene.simulation is not None else {}
-        ran = {name: where[0].directory for name, where in runs.items() if _has_rollout(where[0].directory)}
+            if scene.simulation is not None:
+                runs = {name: [*scenes] for name, scenes in rollouts(scene, directory).items()}
+        ran = {name: first for name, (first, *_) in runs.items() if _has_rollout(first)}
         main = next((name for name in (*first, *ran) if name in ran), "")
         return cls(directory, scene, runs, {main: ran.get(main, directory), **ran}, output)
 
@@ -134,8 +136,7 @@ class Run:
 
     def measured(self, name: str) -> list[Path]:
         """Directories of the rollouts of a variant."""
-        directories = [run.directory for run in self.runs[name]] if name else [self.directory]
-        return list(filter(_has_rollout, directories))
+        return list(filter(_has_rollout, self.runs[name] if name else [self.directory]))
 
     def report_of(self, page: Path) -> Path:
         """The directory of the report about a run directory."""
@@ -421,11 +422,16 @@ def _table_section(stored: Run, page: Page, rows: Mapping[str, Row]
     """Return the section on all variants, in a list, and its table; an empty list and None if no variant was run."""
     if not stored.main:
         return [], None
-    of_variants = [rows[name] for name in stored.runs]
-    simulation = simulation_seconds(stored.scene, of_variants, page.simulation_seconds)
+    scene, of_variants = stored.scene, [rows[name] for name in stored.runs]
+    variants, another = scene.variant or {scene.name: scene}, with_another_kernel(scene)
+    leave_out_kernel(of_variants, another)
+    repeating = [name for name, each in variants.items() if each.coarse_cells == each.flow.cells]
+    simulation = simulation_seconds(of_variants, repeating, page.simulation_seconds)
     add_break_even(of_variants, simulation)
     table = table_of_variants.ErrorAgainstTime(of_variants, stored.main, simulation)
-    return [table_of_variants.section(table, notes(stored.scene))], table
+    remarks = notes(scene.realisations or (), another, {name: each.tracers for name, each in variants.items()},
+                    {name: each.coarse_cells for name, each in variants.items()})
+    return [table_of_variants.section(table, remarks)], table
 
 
 def _write_main(stored: Run, page: Page, rows: Mapping[str, Row], comm: Comm) -> None:

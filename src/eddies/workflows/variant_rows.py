@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,10 +20,9 @@ from eddies.io.provenance import environment, read_json
 from eddies.measures import MEASURES, finite
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES
-from eddies.scene.scene import Scene
+from eddies.scene.scene import Scene, Tracers
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import FAILURE, read_found_step, step_path
-from eddies.workflows.variants import RolloutRun
 
 if TYPE_CHECKING:
     from eddies.workflows.rollout.measured import MeasuredRollout  # needs torch
@@ -41,16 +40,14 @@ BREAK_EVEN = ("break_even_simulation", "break_even_grid")
 COLUMNS = ("name", "label", "method", "kind", "on_grid", "status", "stopped_at", "realisations", *MEASURES, "end",
            *COST, *BEFORE, *BREAK_EVEN, *(f"{measure}_spread" for measure in MEASURES), "settings")
 MODEL, ROLLOUT = STAGES["train"].file, STAGES["simulate"].file
-# Fingerprint of a scene's kernel. Numbers of THROUGH_KERNEL cannot be compared between scenes whose kernels differ.
-_kernel_of = partial(stage_fingerprint, stage="train-kernel")
 
 
-def row(scene: Scene, name: str, runs: Sequence[RolloutRun], realised: Sequence[Mapping[str, Any]],
+def row(scene: Scene, name: str, directories: Sequence[Path], realised: Sequence[Mapping[str, Any]],
         alone: Comm) -> dict[str, Any]:
     """Return the row of a variant, or of a scene without variants, with the keys COLUMNS; a missing number is None.
 
-    realised: `numbers` of each rollout in `runs`; empty if one of them is missing. Times are in turnovers T, and
-    `wall_seconds` and `core_seconds` are per turnover.
+    directories: of the variant's rollouts. realised: `numbers` of each of them; empty if one is missing. Times are in
+    turnovers T, and `wall_seconds` and `core_seconds` are per turnover.
     """
     variant = scene.variant.get(name, scene)
     found: dict[str, Any] = dict.fromkeys(COLUMNS)
@@ -59,13 +56,11 @@ def row(scene: Scene, name: str, runs: Sequence[RolloutRun], realised: Sequence[
               "settings": "; ".join(scene.differences(name)) if scene.variant else ""}
     if realised:
         found |= combined(realised)
-        first, own = runs[0].directory, runs[0].scene
-        found |= before(first / MODEL if own.needs_model else None, step_path(own.simulation, first), alone)
-        if _kernel_of(variant) != _kernel_of(_measure_of(scene)):
-            found |= dict.fromkeys(THROUGH_KERNEL)
+        first = directories[0]
+        step = step_path(variant.simulation, first.parent if scene.realisations else first)
+        found |= before(first / MODEL if variant.needs_model else None, step, alone)
     else:
-        found["status"] = missing_reason(next(run.directory for run in runs
-                                              if not (run.directory / ROLLOUT).exists()))
+        found["status"] = missing_reason(next(each for each in directories if not (each / ROLLOUT).exists()))
     return {key: finite(value) for key, value in found.items()}
 
 
@@ -99,12 +94,29 @@ def combined(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def simulation_seconds(scene: Scene, rows: Sequence[Mapping[str, Any]], of_truth: float | None) -> float | None:
-    """Return the wall seconds per turnover of the direct simulation: those of the fastest variant on the same grid,
-    which is timed like the other variants. Without such a variant, return `of_truth`, the time of the ground truth."""
-    repeated = [row["wall_seconds"] for row in rows if row["wall_seconds"] is not None
-                and (variant := scene.variant.get(row["name"], scene)).coarse_cells == variant.flow.cells]
+def simulation_seconds(rows: Sequence[Mapping[str, Any]], repeating: Collection[str],
+                       of_truth: float | None) -> float | None:
+    """Return the wall seconds per turnover of the direct simulation: those of the fastest variant in `repeating`, the
+    names of variants on the same grid, which are timed like the other variants. Without such a variant, return
+    `of_truth`, the time of the ground truth."""
+    repeated = [row["wall_seconds"] for row in rows if row["wall_seconds"] is not None and row["name"] in repeating]
     return min(repeated, default=of_truth)
+
+
+def with_another_kernel(scene: Scene) -> list[str]:
+    """Return the variants whose kernel differs from that of the scene or, with sets of tracers, of the first variant.
+    Their numbers of THROUGH_KERNEL cannot be compared with those of the others."""
+    kernel_of = partial(stage_fingerprint, stage="train-kernel")
+    kernels = {name: kernel_of(variant) for name, variant in scene.variant.items()}
+    common = next(iter(kernels.values())) if scene.sets else kernel_of(scene.without_variants)
+    return [name for name, kernel in kernels.items() if kernel != common]
+
+
+def leave_out_kernel(rows: Sequence[dict[str, Any]], names: Collection[str]) -> None:
+    """Leave out the numbers of THROUGH_KERNEL in the rows of the variants `names`."""
+    for row in rows:
+        if row["name"] in names:
+            row |= dict.fromkeys(THROUGH_KERNEL)
 
 
 def add_break_even(rows: Sequence[dict[str, Any]], simulation: float | None) -> None:
@@ -149,32 +161,30 @@ def before(model: Path | None, step: Path | None, alone: Comm) -> dict[str, Any]
     return found
 
 
-def notes(scene: Scene) -> list[str]:
-    """Return the sentences that a reader needs to interpret the numbers."""
-    seeds, variants = scene.realisations, scene.variant or {scene.name: scene}
+def notes(seeds: Sequence[int], without_kernel: Sequence[str], tracers: Mapping[str, Tracers],
+          cells: Mapping[str, int]) -> list[str]:
+    """Return the sentences that a reader needs to interpret the numbers.
+
+    seeds: of the realisations. without_kernel: the variants without the numbers of THROUGH_KERNEL. By name of each
+    variant, `tracers` are its tracers, and `cells` the cells of its coarse grid, 0 without one.
+    """
     found = [f"Mean and standard deviation over {len(seeds)} realisations, seeds {', '.join(map(str, seeds))}, that no "
-             "training has seen." if seeds and len(seeds) > 1 else
+             "training has seen." if len(seeds) > 1 else
              "All numbers are from one realisation, so small differences may be due to chance."]
-    own = [name for name, variant in variants.items() if _kernel_of(variant) != _kernel_of(_measure_of(scene))]
-    if own:
+    if without_kernel:
         blank = " and ".join(MEASURES[measure] for measure in THROUGH_KERNEL)
-        found.append(f"{', '.join(own)}: no {blank}, because these numbers need the smoothing kernel, and its "
-                     "settings differ there.")
-    grids = {name: variant.coarse_cells for name, variant in variants.items() if variant.coarse_cells}
+        found.append(f"{', '.join(without_kernel)}: no {blank}, because these numbers need the smoothing kernel, and "
+                     "its settings differ there.")
+    grids = {name: count for name, count in cells.items() if count}
     if grids:
-        kept = ", ".join(f"{(cells - 1) // 3} in {name}" for name, cells in grids.items())
-        widths = {variants[name].tracers.filter_width for name in grids}
+        kept = ", ".join(f"{(count - 1) // 3} in {name}" for name, count in grids.items())
+        widths = {tracers[name].filter_width for name in grids}
         found.append(f"Largest wavenumber |k_i| that a grid keeps by the 2/3 rule: {kept}; the filter wavenumber "
                      f"k_d = pi/d is "
                      f"{', '.join(f'{np.pi / width:.3g}' for width in sorted(widths, reverse=True))}.")
-    if len({(variant.tracers.particles, variant.tracers.filter_width) for variant in variants.values()}) > 1:
+    if len({(each.particles, each.filter_width) for each in tracers.values()}) > 1:
         found.append("Variants have different particles or filters. Compare only those with the same ones.")
     return found
-
-
-def _measure_of(scene: Scene) -> Scene:
-    """Return the scene whose kernel measures all variants: the scene or, with sets of tracers, its first variant."""
-    return next(iter(scene.variant.values())) if scene.sets else scene.without_variants
 
 
 def numbers(stored: MeasuredRollout) -> dict[str, Any]:

@@ -15,7 +15,7 @@ Each directory is a complete run directory: products that are made elsewhere wit
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -41,6 +41,7 @@ class Step:
     directory : where they run.
     variant : name of the variant; None for what all variants share.
     links : by stage, the directory of each product that is made elsewhere and linked here.
+    files : the files of the products that the stages make.
     """
 
     scene: Scene
@@ -48,16 +49,7 @@ class Step:
     directory: Path
     variant: str | None = None
     links: Mapping[str, Path] = field(default_factory=dict)
-
-    @property
-    def files(self) -> list[Path]:
-        """The files of the products that its stages make."""
-        found = [self.directory / STAGES[stage].file for stage in self.stages]
-        return found + [self.directory / each for each in set_files(self.scene)] * ("dns" in self.stages)
-
-    def holder(self, stage: str) -> Path:
-        """The directory of the product of a stage, whether or not the product exists yet."""
-        return self.links.get(stage, self.directory)
+    files: tuple[Path, ...] = ()
 
     def link(self) -> None:
         """Make the directory, and in it relative links to the products of other directories. One rank calls it.
@@ -73,33 +65,25 @@ class Step:
                     path.symlink_to(os.path.relpath(product.resolve(), self.directory.resolve()))
 
 
-@dataclass(frozen=True)
-class RolloutRun:
-    """A rollout of a variant: its scene, and the run directory with all products that it needs."""
-
-    scene: Scene
-    directory: Path
-
-
-def rollouts(scene: Scene, directory: Path) -> dict[str, list[RolloutRun]]:
-    """The rollouts of each variant, one for each realisation. A scene without variants counts as one variant, unless it
-    has sets of tracers."""
+def rollouts(scene: Scene, directory: Path) -> dict[str, dict[Path, Scene]]:
+    """The rollouts of each variant, one for each realisation: the scene of each by its directory, which is a complete
+    run directory. A scene without variants counts as one variant, unless it has sets of tracers."""
     found = {}
     for name in scene.variant or (None,):
         own, where = scene.variant[name] if name else scene.without_variants, directory / (name or "")
         if own.sets:
             continue
         if scene.realisations is None:
-            found[name or scene.name] = [RolloutRun(own, where)]
+            found[name or scene.name] = {where: own}
             continue
         model = own.model if "train" in own.stages else None
         if model is not None and model.path is None:
             model = replace(model, path=str(where))
         step_from = str(where) if own.simulation.finds_step else own.simulation.step_from
         simulation = replace(own.simulation, start=0.0, step_from=step_from, confirmed_on=None)
-        found[name or scene.name] = [
-            RolloutRun(replace(own.realisation(seed), model=model, training=None, simulation=simulation),
-                       where / f"{REALISATION}{seed}") for seed in scene.realisations]
+        found[name or scene.name] = {
+            where / f"{REALISATION}{seed}": replace(own.realisation(seed), model=model, training=None,
+                                                    simulation=simulation) for seed in scene.realisations}
     return found
 
 
@@ -111,7 +95,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
     """
     if not scene.variant and not scene.realisations:
         making = tuple(stage for stage in stages if stage in MAKING)
-        return [Step(scene, making, directory)] if making else []
+        return [Step(scene, making, directory, files=_files(making, directory, scene.sets))] if making else []
     whole, seeds = scene.without_variants, scene.realisations or ()
     # Fingerprint of each ground truth that a variant may use, and its directory relative to that of the scene or of a
     # realisation.
@@ -141,9 +125,9 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
             own = replace(own, simulation=replace(own.simulation, confirmed_on=confirmed_on))
         trained = ("train",) if not seeds or own.model is not None and own.model.path is None else ()
         planned.append((name, own, directory / (name or ""), (*SHARED, *trained, "find-step")))
-    for together in zip(*(runs[name or scene.name] for name in chosen)):
-        planned += [(name, run.scene, run.directory, (*SHARED, *(("train",) if seeds else ()), "simulate"))
-                    for name, run in zip(chosen, together)]
+    for together in zip(*(runs[name or scene.name].items() for name in chosen)):
+        planned += [(name, own, where, (*SHARED, *(("train",) if seeds else ()), "simulate"))
+                    for name, (where, own) in zip(chosen, together)]
     found: list[Step] = []
     made: dict[tuple[str, str], Path] = {}
     for name, own, where, possible in planned:
@@ -163,5 +147,11 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
                              for path, fingerprint in set_files(own).items()}
                 working += [stage] if stage in stages else []
         if working:
-            found.append(Step(own, tuple(working), where, name, links))
+            found.append(Step(own, tuple(working), where, name, links, _files(working, where, own.sets)))
     return found
+
+
+def _files(stages: Sequence[str], directory: Path, sets: Collection[str]) -> tuple[Path, ...]:
+    """The files of the products that stages make in a directory; `sets` are the names of the sets of tracers."""
+    of_sets = [directory / name / STAGES["dns"].file for name in sets if "dns" in stages]
+    return *(directory / STAGES[stage].file for stage in stages), *of_sets
