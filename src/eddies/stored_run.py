@@ -68,7 +68,7 @@ class StoredRun:
         """A group that is computed from the rollout, frame by frame."""
         from mpi4py import MPI
 
-        from eddies.io.datasets import ComputedArray, computed_group
+        from eddies.io.datasets import as_dataset, computed_array, known_array
         from eddies.workflows.rollout.measured import open_rollout
 
         def make(column: str, frames: Sequence[int]) -> list[np.ndarray]:
@@ -81,16 +81,16 @@ class StoredRun:
                                 "fields and gradients")
             times = measured.groups[group].times
             samples = {column: measured.groups[group].read(0, column) for column in measured.groups[group].columns}
-        arrays = {"time": ComputedArray.of(f"{group}/time", times)}
+        arrays = {"time": known_array(f"{group}/time", times)}
         size = np.arange(len(next(iter(samples.values()))))
         if group.startswith("spectra"):
-            arrays["wavenumber"] = ComputedArray.of(f"{group}/wavenumber", size)
+            arrays["wavenumber"] = known_array(f"{group}/wavenumber", size)
         elif not group.startswith("fields"):
-            arrays["id"] = ComputedArray.of("particles/truth/id", size)
+            arrays["id"] = known_array("particles/truth/id", size)
         for column, sample in samples.items():
             place = f"{group}/{column}" + "/value" * group.startswith("particles")
-            arrays[column] = ComputedArray(place, (len(times), *sample.shape), sample.dtype, partial(make, column))
-        return computed_group(arrays)
+            arrays[column] = computed_array(place, (len(times), *sample.shape), sample.dtype, partial(make, column))
+        return as_dataset(arrays, {})
 
     @cached_property
     def scene(self) -> Scene:

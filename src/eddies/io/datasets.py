@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,43 +23,43 @@ try:
     from xarray.core.indexing import (BasicIndexer, IndexingSupport, LazilyIndexedArray, OuterIndexer,
                                       explicit_indexing_adapter)
 except ImportError:
-    xarray = None
+    xarray, BackendArray = None, object
 
 AXES = {"xyz": ["x", "y", "z"], "component": ["x", "y", "z"]}
 EDGE = 2 * math.pi  # of the cube, in units of L
 
 
-@dataclass(frozen=True)
-class ComputedArray:
-    """An array that is not in a file. Its frames, along the first axis, are computed when they are used."""
+@dataclass(frozen=True, eq=False)
+class Array(BackendArray):
+    """An array of which xarray reads only the parts that are used."""
 
-    place: str  # the path that it would have in rollout.h5, which gives its units and description
     shape: tuple[int, ...]
     dtype: np.dtype
-    make: Callable[[Sequence[int]], Sequence[np.ndarray]]  # returns the frames with these indices
+    attrs: Mapping[str, Any]  # may hold units, axes and description
+    read: Callable[[tuple], np.ndarray]  # returns the part with these indices; () stands for the whole array
 
-    @classmethod
-    def of(cls, place: str, values: np.ndarray) -> ComputedArray:
-        """An array with known values."""
-        return cls(place, values.shape, values.dtype, lambda frames: [values[frame] for frame in frames])
+    def __getitem__(self, key: BasicIndexer | OuterIndexer) -> np.ndarray:
+        return explicit_indexing_adapter(key, self.shape, IndexingSupport.OUTER_1VECTOR, self.read)
 
-    @property
-    def ndim(self) -> int:
-        """Number of axes."""
-        return len(self.shape)
 
-    @property
-    def attrs(self) -> dict[str, str]:
-        """Units, axes, description."""
-        return dataset_attributes("rollout", self.place)
+def known_array(place: str, values: np.ndarray) -> Array:
+    """An array with known values, described as the dataset at a path in rollout.h5."""
+    return Array(values.shape, values.dtype, dataset_attributes("rollout", place), values.__getitem__)
 
-    def __getitem__(self, key: Any) -> np.ndarray:
-        first, *others = (key if isinstance(key, tuple) else (key,)) or (slice(None),)
-        frames = np.arange(self.shape[0])[first]
-        made = [np.asarray(values[tuple(others)]) for values in self.make(np.atleast_1d(frames).tolist())]
+
+def computed_array(place: str, shape: tuple[int, ...], dtype: np.dtype,
+                   make: Callable[[Sequence[int]], Sequence[np.ndarray]]) -> Array:
+    """An array whose frames, along the first axis, are computed when they are used: `make` returns the frames with
+    these indices. It is described as the dataset at a path in rollout.h5."""
+    def read(part: tuple) -> np.ndarray:
+        first, *others = part or (slice(None),)
+        frames = np.arange(shape[0])[first]
+        made = [np.asarray(values[tuple(others)]) for values in make(np.atleast_1d(frames).tolist())]
         if not frames.ndim:
             return made[0]
-        return np.stack(made) if made else np.zeros((0, *self.shape[1:]), self.dtype)
+        return np.stack(made) if made else np.zeros((0, *shape[1:]), dtype)
+
+    return Array(shape, dtype, dataset_attributes("rollout", place), read)
 
 
 def open_group(path: Path, name: str) -> Any:
@@ -66,28 +67,19 @@ def open_group(path: Path, name: str) -> Any:
 
     ProductError if there is no such group or file.
     """
-    def read(array: str, key: tuple) -> np.ndarray:
+    def read(array: str, part: tuple) -> np.ndarray:
         with open_to_read(path) as file:
-            return np.asarray(file[array][key])
+            return np.asarray(file[array][part])
 
     with open_to_read(path) as file:
         group = file.get(name)
         if not isinstance(group, h5py.Group):
             raise ProductError(f"{path}: holds no {name}; it holds: {', '.join(groups_in(file))}")
         columns = {key: item.get("value") if isinstance(item, h5py.Group) else item for key, item in group.items()}
-        arrays = {key: item for key, item in columns.items() if isinstance(item, h5py.Dataset)}
-        if xarray is None:
-            return {key: array[()] for key, array in arrays.items()}
+        arrays = {key: Array(item.shape, item.dtype, dict(item.attrs), partial(read, item.name))
+                  for key, item in columns.items() if isinstance(item, h5py.Dataset)}
         attributes = {key: python_value(value) for key, value in group.attrs.items()}
-        return _dataset({key: (array, lambda part, array=array.name: read(array, part))
-                         for key, array in arrays.items()}, attributes)
-
-
-def computed_group(arrays: Mapping[str, ComputedArray]) -> Any:
-    """Computed arrays by name, in the form in which `open_group` returns stored ones."""
-    if xarray is None:
-        return {key: array[:] for key, array in arrays.items()}
-    return _dataset({key: (array, array.__getitem__) for key, array in arrays.items()}, {})
+    return as_dataset(arrays, attributes)
 
 
 def groups_in(file: h5py.File) -> list[str]:
@@ -103,18 +95,20 @@ def groups_in(file: h5py.File) -> list[str]:
     return names
 
 
-def _dataset(arrays: Mapping[str, tuple[Any, Callable[[tuple], np.ndarray]]], attributes: Mapping[str, Any]) -> Any:
-    """An xarray Dataset. `arrays` maps each name to an array and a function that reads a part of this array. Times,
-    ids, wavenumbers and points become coordinates."""
+def as_dataset(arrays: Mapping[str, Array], attributes: Mapping[str, Any]) -> Any:
+    """An xarray Dataset of arrays by name. Times, ids, wavenumbers and points become coordinates. Without xarray, a
+    dictionary of numpy arrays."""
+    if xarray is None:
+        return {key: array.read(()) for key, array in arrays.items()}
     variables, coordinates = {}, {}
-    for key, (array, read) in arrays.items():
+    for key, array in arrays.items():
         axes = array.attrs.get("axes", "").split()
         axes = axes if len(axes) == array.ndim else [f"{key}_{axis}" for axis in range(array.ndim)]
         words = {name: array.attrs[name] for name in ("units", "description") if name in array.attrs}
         if axes == [key] or (key == "id" and axes == ["particle"]):
-            coordinates[axes[0]] = (axes, array[()], words)
+            coordinates[axes[0]] = (axes, array.read(()), words)
         else:
-            variable = xarray.Variable(axes, LazilyIndexedArray(LazyArray(array, read)), words)
+            variable = xarray.Variable(axes, LazilyIndexedArray(array), words)
             scalar = "component" in axes and array.shape[axes.index("component")] == 1
             variables[key] = variable.isel(component=0) if scalar else variable
         for axis, size in zip(axes, array.shape):
@@ -123,14 +117,3 @@ def _dataset(arrays: Mapping[str, tuple[Any, Callable[[tuple], np.ndarray]]], at
             elif axis in ("x", "y", "z"):
                 coordinates.setdefault(axis, ([axis], EDGE * np.arange(size) / size, {"units": "L"}))
     return xarray.Dataset(variables, coordinates, attributes)
-
-
-if xarray is not None:
-    class LazyArray(BackendArray):
-        """An array of which xarray reads only the parts that are used."""
-
-        def __init__(self, array: h5py.Dataset | ComputedArray, read: Callable[[tuple], np.ndarray]) -> None:
-            self.shape, self.dtype, self._read = array.shape, array.dtype, read
-
-        def __getitem__(self, key: BasicIndexer | OuterIndexer) -> np.ndarray:
-            return explicit_indexing_adapter(key, self.shape, IndexingSupport.OUTER_1VECTOR, self._read)
