@@ -74,9 +74,7 @@ def ring_bandwidth(comm: MPI.Comm) -> tuple[float, list[str]]:
 def parallel_file(comm: MPI.Comm) -> list[str]:
     """Write a file in the current folder, all ranks together, and read it. Return complaints about its content."""
     import h5py
-    number = np.array([os.getpid()])  # a name of its own for each run, the same on all ranks
-    comm.Bcast(number)
-    path = Path(f"doctor-{number[0]}.h5")
+    path = Path(f"doctor-{comm.bcast(os.getpid())}.h5")  # a name of its own for each run, the same on all ranks
     with h5py.File(path, "w", driver="mpio", comm=comm) as file:
         rows = file.create_dataset("rank", (comm.size,), int)
         with rows.collective:
@@ -89,38 +87,22 @@ def parallel_file(comm: MPI.Comm) -> list[str]:
     return [] if good else ["a file written by all ranks together reads back wrong"]
 
 
-def total(comm: MPI.Comm, number: int) -> int:
-    """Return the sum over the ranks."""
-    result = np.zeros(1, int)
-    comm.Allreduce(np.array([number]), result)
-    return int(result[0])
-
-
-def print_in_turn(comm: MPI.Comm, text: str) -> None:
-    """Print on rank 0 the text of every rank, in order, up to 2000 bytes of each."""
-    mine = np.frombuffer(text.encode()[:2000].ljust(2000), np.uint8)
-    texts = np.empty((comm.size, mine.size), np.uint8)
-    comm.Gather(mine, texts)
-    if comm.rank == 0:
-        print(*(row.tobytes().decode(errors="replace").rstrip() for row in texts), sep="\n", flush=True)
-
-
 def main() -> int:
     comm = MPI.COMM_WORLD
     libraries, complaints = versions()
     bandwidth, wrong = ring_bandwidth(comm)
     complaints += wrong + unconnected(comm)
     # A rank without parallel h5py would leave the others waiting in the collective calls.
-    if comm.size > 1 and total(comm, len(complaints)) == 0:
+    if comm.size > 1 and comm.allreduce(len(complaints)) == 0:
         complaints += parallel_file(comm)
     line = (f"rank {comm.rank} of {comm.size} on {platform.node()}: {len(os.sched_getaffinity(0))} cores, "
             f"OMP_NUM_THREADS {os.environ.get('OMP_NUM_THREADS', 'unset')}, "
             f"{MPI.Get_library_version().split(',')[0].strip()}, {libraries}, "
             f"{bandwidth / 1e9:.2f} GB/s to rank {(comm.rank + 1) % comm.size}")
-    print_in_turn(comm, "\n".join([line, *(f"  rank {comm.rank}: {complaint}" for complaint in complaints)]))
-    count = total(comm, len(complaints))
+    texts = comm.gather("\n".join([line, *(f"  rank {comm.rank}: {complaint}" for complaint in complaints)]))
+    count = comm.allreduce(len(complaints))
     if comm.rank == 0:
-        print(f"{count} complaints" if count else "all is well", flush=True)
+        print(*texts, f"{count} complaints" if count else "all is well", sep="\n", flush=True)
     return min(count, 100)
 
 
