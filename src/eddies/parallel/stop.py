@@ -95,9 +95,7 @@ class StopRequest:
         self._checkpoint_at = time.monotonic() + self._interval
 
     def _raise_lock_loss(self) -> None:
-        error = next(filter(None, (lock_lost() for lock_lost in self._lock_losses)), None)
-        if error is not None:
-            raise error
+        raise next(filter(None, (lock_lost() for lock_lost in self._lock_losses)))
 
     def _own_answer(self) -> int:
         if any(lock_lost() for lock_lost in self._lock_losses):
