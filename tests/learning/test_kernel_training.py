@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from eddies.flow.tracers import release
-from eddies.learning.kernel_training import KernelLossWeights, KernelSample, KernelTrainer
+from eddies.learning.kernel_training import KernelSample, KernelTrainer
 from eddies.learning.optimization import Adam
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_field import ParticleField, grid_points
@@ -31,7 +31,7 @@ def sample_of(comm, support):
 
 def fit(comm, support=2.4 * SPACING, steps=4, rates=(1e-3, 1e-3)):
     sample, network = sample_of(comm, support), KernelNetwork(support, (8, 8), seed=1)
-    trainer = KernelTrainer(network, [sample], KernelLossWeights(1.0, 0.5), 200, seed=2)
+    trainer = KernelTrainer(network, [sample], 1.0, 0.5, 200, seed=2)
     optimizer = Adam(comm, network.parameters(), steps, *rates)
     return sample, network, [trainer.step(optimizer, step) for step in range(steps)]
 

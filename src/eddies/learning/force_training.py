@@ -14,7 +14,7 @@ from eddies.learning.losses import kullback_leibler, mean_square_share, soft_his
 from eddies.learning.optimization import Adam, shared_values
 from eddies.parallel.reduction import global_sum
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.exchanges import mean_over_ranks, relative_error, sum_over_ranks
+from eddies.particles.exchanges import mean_over_ranks, relative_error, root_mean_square, sum_over_ranks
 from eddies.particles.model import LagrangianModel
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.neighborhood import Neighborhood
@@ -91,16 +91,12 @@ class TrainingFrame:
         self.later = later
         self.kept = self.model.linear_rates(dynamics.context(particles))
         dynamics.release()  # frees kriging weights, which nonlinear terms may not need
-        self.acceleration_rms, self.total = self._rms(acceleration)
-        self.density_rate_rms = None if density_rate is None else self._rms(density_rate)[0]
+        comm = self.decomposition.comm
+        self.total = int(global_sum(comm, len(particles)))
+        self.acceleration_rms = root_mean_square(comm, acceleration)
+        self.density_rate_rms = None if density_rate is None else root_mean_square(comm, density_rate)
         self._sorted_ids, self._row_of_sorted = torch.sort(particles.id)
         self._within: KernelNeighborhood | None = None
-
-    def _rms(self, rate: Tensor) -> tuple[float, int]:
-        """Root mean square of one component, and number of rows, both over all ranks."""
-        square = float(rate.double().square().sum())
-        square, count = global_sum(self.decomposition.comm, np.array([square, len(rate)]))
-        return float(np.sqrt(square / (count * rate.shape[1:].numel()))), int(count)
 
     @cached_property
     def fluctuation(self) -> Tensor:
@@ -109,9 +105,9 @@ class TrainingFrame:
         d is the filter width and u' the rms of one component of v - <v>. The scalar product with an acceleration is the
         power in units of u'^3 / d.
         """
-        velocity = self.particles.velocity
-        velocity = velocity - mean_over_ranks(self.decomposition.comm, velocity)
-        return velocity * (self.model.flow.scales.filter_width / self._rms(velocity)[0] ** 3)
+        velocity, comm = self.particles.velocity, self.decomposition.comm
+        velocity = velocity - mean_over_ranks(comm, velocity)
+        return velocity * (self.model.flow.scales.filter_width / root_mean_square(comm, velocity) ** 3)
 
     def rows(self, ids: np.ndarray) -> Tensor:
         """Indices of those particles of this rank whose id is among `ids`."""

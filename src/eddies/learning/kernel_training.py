@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -13,14 +11,6 @@ from eddies.learning.optimization import Adam, shared_values
 from eddies.parallel.reduction import global_sum
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.smoothing_kernels import KernelNetwork
-
-
-@dataclass(frozen=True)
-class KernelLossWeights:
-    """Weights of Eq. 8; the velocity loss has weight 1."""
-
-    gradient: float = 1.0
-    normalization: float = 0.0
 
 
 class KernelSample:
@@ -60,11 +50,18 @@ class KernelTrainer:
     """Fits a kernel network to samples. Each step lowers the loss of Eq. 8 on random grid points of one sample.
 
     Points are drawn from (seed, step) alone, so that the loss is the same on any number of ranks.
+
+    Parameters
+    ----------
+    network, samples : the kernel, and the fields that it is fitted to.
+    gradient_weight, normalization_weight : weights of Eq. 8; the velocity loss has weight 1.
+    points : number of grid points in a step.
     """
 
-    def __init__(self, network: KernelNetwork, samples: list[KernelSample], weights: KernelLossWeights, points: int,
-                 seed: int) -> None:
-        self.network, self.samples, self.weights = network, samples, weights
+    def __init__(self, network: KernelNetwork, samples: list[KernelSample], gradient_weight: float,
+                 normalization_weight: float, points: int, seed: int) -> None:
+        self.network, self.samples = network, samples
+        self.gradient_weight, self.normalization_weight = gradient_weight, normalization_weight
         self.comm, self.total = samples[0].decomposition.comm, samples[0].decomposition.planes**3
         self.points, self.seed = min(points, self.total), seed
 
@@ -79,12 +76,12 @@ class KernelTrainer:
         error = velocity - sample.field[rows]
         shares = {"velocity": mean_square_share(error, sample.mean_square[0] ** 0.5, self.points)}
         total = shares["velocity"]
-        if self.weights.gradient > 0:
+        if self.gradient_weight > 0:
             error = (gradient - sample.gradient[rows]).flatten(1)
             shares["gradient"] = mean_square_share(error, sample.mean_square[1] ** 0.5, self.points)
-            total = total + self.weights.gradient * shares["gradient"]
-        if self.weights.normalization > 0:
+            total = total + self.gradient_weight * shares["gradient"]
+        if self.normalization_weight > 0:
             shares["normalization"] = (self.network.integral() - 1) ** 2 / self.comm.size
-            total = total + self.weights.normalization * shares["normalization"]
+            total = total + self.normalization_weight * shares["normalization"]
         norm = optimizer.step(total)
         return {**shared_values(self.comm, {"loss": total, **shares}), "gradient_norm": norm}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,6 +15,7 @@ from eddies.learning.losses import mean_square_share
 from eddies.learning.optimization import Adam, shared_values
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_sum
+from eddies.particles.exchanges import root_mean_square
 from eddies.particles.integrators import Integrator
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
@@ -94,8 +94,8 @@ class RolloutTrainer:
         """This rank's weighted shares of "rollout_loss" and, if used, "energy_loss" for a window; collective."""
         shares: dict[str, list[Tensor]] = {"rollout_loss": []}
         for reached, particles in self._frames(window.particles, horizon):
-            shares["rollout_loss"] += [mean_square_share(error, self._scale(true, start), self.total)
-                                       for error, true, start in self._errors(window, reached, particles)]
+            shares["rollout_loss"] += [mean_square_share(error, root_mean_square(self.comm, change), self.total)
+                                       for error, change in self._errors(window, reached, particles)]
             if self.energy_weight > 0:
                 shares.setdefault("energy_loss", []).append(
                     self.energy_weight * self._energy_share(window, reached, particles))
@@ -155,16 +155,13 @@ class RolloutTrainer:
         return moved, dict(zip(after[1], columns[len(after[0]):]))
 
     def _errors(self, window: TrainingWindow, frame: int,
-                particles: ParticleSet) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Yield error, true value and start value of the velocity, then of the density if the model learns its rate."""
-        yield particles.velocity - window.velocity[frame], window.velocity[frame], window.particles.velocity
+                particles: ParticleSet) -> Iterator[tuple[Tensor, Tensor]]:
+        """Yield the error and the true change of the velocity, then of the density if the model learns its rate."""
+        true = window.velocity[frame]
+        yield particles.velocity - true, true - window.particles.velocity
         if self.integrator.dynamics.model.learns_density:
-            yield particles.density - window.density[frame], window.density[frame], window.particles.density
-
-    def _scale(self, true: Tensor, start: Tensor) -> float:
-        """Root mean square of the true change of one component, over all ranks."""
-        squares = global_sum(self.comm, float((true - start).double().square().sum()))
-        return float(np.sqrt(squares / (self.total * math.prod(true.shape[1:]))))
+            true = window.density[frame]
+            yield particles.density - true, true - window.particles.density
 
 
 # The wrapper of `checkpoint` loads torch's compiler, which takes two seconds.

@@ -68,6 +68,12 @@ def mean_over_ranks(comm: Comm, rows: Tensor) -> Tensor:
     return total[:-1] / total[-1]
 
 
+def root_mean_square(comm: Comm, values: Tensor) -> float:
+    """Root mean square of all entries of all ranks, of vectors that of one component; collective."""
+    square, count = global_sum(comm, np.array([float(values.double().square().sum()), values.numel()]))
+    return float(np.sqrt(square / count))
+
+
 def relative_error(comm: Comm, error: Tensor, exact: Tensor) -> float:
     """Normalised L2 error |error| / |exact| over the entries of all ranks, NaN if `exact` is zero; collective."""
     square, whole = global_sum(comm, np.array([float(part.detach().double().square().sum())

@@ -15,7 +15,7 @@ from eddies.analysis.lagrangian import evenly
 from eddies.io.checkpoint import Guard
 from eddies.io.provenance import product_provenance
 from eddies.io.weights import load_tables, load_weights, save_weights
-from eddies.learning.kernel_training import KernelLossWeights, KernelSample, KernelTrainer
+from eddies.learning.kernel_training import KernelSample, KernelTrainer
 from eddies.learning.training import Phase, Training
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import migrate
@@ -121,8 +121,8 @@ def training_of(settings: Kernel, support: float, mean_volume: float | None, see
     networks, phases = nn.ModuleDict(), []
     for name, gradient_weight in (("learned", settings.gradient_weight), ("learned_no_gradient", 0.0)):
         networks[name] = KernelNetwork(support, settings.hidden, settings.cutoff, seed, mean_volume).to(dtype)
-        weights = KernelLossWeights(gradient_weight, settings.normalization_weight)
-        trainer = KernelTrainer(networks[name], samples, weights, settings.points, seed)
+        trainer = KernelTrainer(networks[name], samples, gradient_weight, settings.normalization_weight,
+                                settings.points, seed)
         phases.append(Phase(name, np.ones(settings.steps), rates, trainer.step))
     return Training(samples[0].decomposition.comm, networks, phases)
 
