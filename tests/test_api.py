@@ -1,19 +1,12 @@
 """The Python functions: names, and runs from a program."""
 
 import logging
-import subprocess
-import sys
 from dataclasses import replace
 
 import pytest
 
 import eddies
-
-
-def test_importing_loads_no_large_library():
-    code = ("import sys, eddies; eddies.load_scene; eddies.TermSettings; eddies.number; eddies.Flow; eddies.run;"
-            "sys.exit(bool({'torch', 'mpi4py', 'numpy', 'h5py'} & set(sys.modules)))")
-    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+from tests.commands import on_ranks
 
 
 def test_names():
@@ -77,24 +70,22 @@ def test_a_scene_that_a_program_makes_and_names_a_run_directory(comm, tmp_path, 
 
 
 def test_an_error_that_one_rank_meets_ends_the_job(tmp_path):
-    from tests.test_cli import start
     program = tmp_path / "program.py"
     program.write_text("import eddies, eddies.api\nfrom mpi4py import MPI\n"
                        "def fail(scene, comm):\n    if comm.rank == 1:\n        raise RuntimeError('lost')\n"
                        "    comm.Barrier()\n"
                        "import eddies.workflows.check\neddies.workflows.check.run = fail\neddies.check('abc')\n")
-    code, _, errors = start(2, program)
-    assert code != 0 and "RuntimeError: lost" in errors
+    ended = on_ranks(2, program)
+    assert ended.returncode != 0 and "RuntimeError: lost" in ended.stderr
 
 
 def test_a_file_that_hdf5_could_not_write_ends_the_job_of_several_ranks(tmp_path):
     """All ranks meet the error; one rank goes on."""
-    from tests.test_cli import start
     program = tmp_path / "program.py"
     program.write_text("import eddies, eddies.io.new_files, eddies.workflows.check\n"
                        "def fail(scene, comm):\n    raise eddies.UserError('full')\n"
                        "eddies.workflows.check.run, eddies.io.new_files.writing_failed = fail, lambda: True\n"
                        "try:\n    eddies.check('abc')\nexcept eddies.UserError:\n    print('goes on')\n")
     for ranks in (1, 2):
-        code, output, errors = start(ranks, program)
-        assert (code == 0) == ("goes on" in output) == (ranks == 1), errors
+        ended = on_ranks(ranks, program)
+        assert (ended.returncode == 0) == ("goes on" in ended.stdout) == (ranks == 1), ended

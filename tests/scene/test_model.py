@@ -1,7 +1,5 @@
 """The model of a scene: its terms, their settings in [model.NAME], classes of the user's, the density of the flow."""
 
-import subprocess
-import sys
 from dataclasses import fields, replace
 
 import pytest
@@ -193,14 +191,6 @@ def test_needs_of_methods(own):
     assert Simulation(**rollout).needs == ("model",)
     assert Simulation(method="none", **rollout).needs == Simulation(method="eulerian", **rollout).needs == ()
     refused('needs = ["charge"]: must be a tuple', lambda: Simulation(method="own_method:Run", **rollout).needs)
-
-
-def test_a_scene_with_a_model_loads_no_torch():
-    code = ("import sys, eddies; scene = eddies.load_scene('tiny'); scene.to_toml(); eddies.Model(preset='wcsph');"
-            "from eddies.workflows.run_directory.fingerprints import stage_fingerprint;"
-            "stage_fingerprint(scene, 'train'); dir(eddies);"
-            "sys.exit(bool({'torch', 'mpi4py', 'numpy', 'h5py', 'pyfftw'} & set(sys.modules)))")
-    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
 
 
 def test_another_list_on_the_command_line_replaces_that_of_the_file(tmp_path):

@@ -13,8 +13,8 @@ from eddies.scene.scene import load_scene
 from eddies.workflows.diff import diff_lines
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 from eddies.workflows.status import status_lines
+from tests.commands import run_cli
 from tests.small_scene import TINY
-from tests.test_cli import run_cli
 from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_rollout
 
 
