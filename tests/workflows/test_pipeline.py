@@ -13,9 +13,9 @@ import pytest
 from eddies.scene.model import BUILT_IN_PREFIX, WEIGHTS, built_in_weights
 from eddies.scene.scene import load_scene
 from eddies.stored_run import open_run
+from tests.commands import run_cli
 from tests.left_out import leave_out_figures
 from tests.small_scene import TINY
-from tests.test_cli import run_cli
 
 pytestmark = pytest.mark.mpi(2, timeout=240)
 CHANGES = ["kernel.steps=20", "training.steps=30"]
