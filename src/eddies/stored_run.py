@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from eddies.errors import UserError
-from eddies.pipeline import STAGES
+from eddies.pipeline import MAKER_OF
 from eddies.scene.rules import shortened
 from eddies.scene.scene import Scene, load_scene
 
@@ -37,13 +37,13 @@ class StoredRun:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         if not self.products:
-            raise UserError(f"{self.path}: holds none of {', '.join(self._files.values())}; run `eddies dns SCENE` "
-                            "first")
+            raise UserError(f"{self.path}: holds none of {', '.join(stage.file for stage in MAKER_OF.values())}; run "
+                            "`eddies dns SCENE` first")
 
     @property
     def products(self) -> tuple[str, ...]:
         """Names of the existing products, such as "ground_truth", "kernel", "model", "rollout"."""
-        return tuple(name for name, file in self._files.items() if (self.path / file).is_file())
+        return tuple(name for name, stage in MAKER_OF.items() if (self.path / stage.file).is_file())
 
     @property
     def groups(self) -> list[str]:
@@ -52,7 +52,7 @@ class StoredRun:
         from eddies.io.datasets import groups_in
         found = []
         for product in self.products:
-            with open_to_read(self.path / self._files[product]) as file:
+            with open_to_read(self.path / MAKER_OF[product].file) as file:
                 found += [f"{product}/{group}" for group in groups_in(file)]
         return found + [name for name in MADE if name not in found and "rollout" in self.products]
 
@@ -62,7 +62,7 @@ class StoredRun:
         product, _, group = name.partition("/")
         if product not in self.products:
             raise UserError(f"{self.path}: holds no {product}; it holds: {', '.join(self.products)}")
-        return self._made(group) if name in MADE else open_group(self.path / self._files[product], group)
+        return self._made(group) if name in MADE else open_group(self.path / MAKER_OF[product].file, group)
 
     def _made(self, group: str) -> Any:
         """A group that is computed from the rollout, frame by frame."""
@@ -108,7 +108,8 @@ class StoredRun:
         if not path.is_file():
             raise UserError(f"{path}: no such file; run `eddies report {self.path}` first")
         made = path.stat().st_mtime
-        newer = [file for file in map(self._files.get, self.products) if (self.path / file).stat().st_mtime > made]
+        files = [MAKER_OF[name].file for name in self.products]
+        newer = [file for file in files if (self.path / file).stat().st_mtime > made]
         if newer:
             warnings.warn(f"{path}: is older than {', '.join(newer)}; run `eddies report {self.path}` again",
                           stacklevel=2)
@@ -123,8 +124,7 @@ class StoredRun:
         """
         found = self[chosen(TRAJECTORIES, of)]
         if ids is not None and not isinstance(ids, slice):
-            count = np.asarray(found["position"]).shape[1] if isinstance(found, dict) else found.sizes["particle"]
-            check_ids(np.asarray(ids), count)
+            check_ids(np.asarray(ids), found["position"].shape[1])
         if isinstance(found, dict):  # without xarray
             rows = slice(None) if ids is None else np.asarray(ids)
             found = {key: values[:, rows] if values.ndim > 1 else values[rows] if key == "id" else values
@@ -168,10 +168,6 @@ class StoredRun:
         return {drawing.name: drawing.image for section in sections_of(self.path, MPI.COMM_SELF)
                 for drawing in section.illustrations}
 
-    @property
-    def _files(self) -> dict[str, str]:
-        return {stage.product: stage.file for stage in STAGES.values() if stage.product}
-
     def __repr__(self) -> str:
         return f"StoredRun({str(self.path)!r}: {', '.join(self.products)})"
 
@@ -212,6 +208,4 @@ def at_time(found: Any, name: str, time: float | None) -> Any:
     around = np.diff(times).max() if len(times) > 1 else np.inf
     if time is not None and not times[0] - around <= time <= times[-1] + around:
         raise UserError(f"time = {time:g}: must be between {times[0]:g} and {times[-1]:g}, the stored times")
-    if isinstance(found, dict):  # without xarray
-        return found[name][-1 if time is None else int(np.argmin(np.abs(found["time"] - time)))]
-    return found[name].isel(time=-1) if time is None else found[name].sel(time=time, method="nearest")
+    return found[name][-1 if time is None else int(np.argmin(np.abs(times - time)))]
