@@ -8,9 +8,7 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from eddies.io.hdf5 import open_product
-from eddies.io.provenance import read_provenance
-from eddies.io.weights import load_tables, load_weights, save_weights
+from eddies.io.weights import load_weights, save_weights
 from eddies.scene.model import WEIGHTS
 
 KEPT = ("a_priori", "feature_range")  # tables: errors on their own flow, and the range of what a network was given
@@ -18,13 +16,10 @@ KEPT = ("a_priori", "feature_range")  # tables: errors on their own flow, and th
 
 def keep(run: Path, name: str) -> Path:
     """Write the file of the package; returns its path."""
-    comm, source = MPI.COMM_SELF, run / "model.h5"
-    description, weights = load_weights(comm, source, "model")
-    with open_product(comm, source, "model") as file:
-        provenance = read_provenance(file)
-    tables = {name: table for name, table in load_tables(comm, source).items() if name in KEPT}
+    stored = load_weights(MPI.COMM_SELF, run / "model.h5", "model")
+    tables = {title: table for title, table in stored.tables.items() if title in KEPT}
     target = WEIGHTS / f"{name}.h5"
-    save_weights(comm, target, "model", description, weights, provenance, tables)
+    save_weights(MPI.COMM_SELF, target, "model", stored.description, stored.weights, stored.provenance, tables)
     return target
 
 

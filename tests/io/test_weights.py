@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from eddies.io.hdf5 import ProductError
-from eddies.io.weights import load_tables, load_weights, save_weights
+from eddies.io.weights import load_weights, save_weights
 
 DESCRIPTION = {"basis": "corrected", "hidden": [16, 16], "scales": {"filter_width": 0.39}}
 
@@ -24,13 +24,12 @@ def save(comm, path):
 @pytest.mark.mpi(1, 2)
 def test_weights_survive(comm, tmp_path):
     save(comm, tmp_path / "m.h5")
-    description, loaded = load_weights(comm, tmp_path / "m.h5", "model")
-    assert description == DESCRIPTION
-    assert loaded.keys() == tensors().keys()
+    stored = load_weights(comm, tmp_path / "m.h5", "model")
+    assert stored.description == DESCRIPTION and stored.provenance["fingerprint"] == "abc"
+    assert stored.weights.keys() == tensors().keys()
     for name, tensor in tensors().items():
-        assert loaded[name].dtype == tensor.dtype and np.array_equal(loaded[name], tensor)
-    tables = load_tables(comm, tmp_path / "m.h5")
-    assert tables.keys() == {"history"} and np.array_equal(tables["history"]["step"], np.arange(4))
+        assert stored.weights[name].dtype == tensor.dtype and np.array_equal(stored.weights[name], tensor)
+    assert stored.tables.keys() == {"history"} and np.array_equal(stored.tables["history"]["step"], np.arange(4))
 
 
 @pytest.mark.mpi(1, 2)

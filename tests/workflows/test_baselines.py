@@ -83,7 +83,7 @@ def energy(columns):
 @pytest.mark.mpi(2)
 def test_an_untrained_model_of_smoothed_particles_keeps_momentum_and_integrates_its_density(comm, folder):
     train.run(load_scene(folder / "baseline.toml", SMOOTHED), comm, folder)
-    _, weights = load_weights(comm, folder / "model.h5", "model")
+    weights = load_weights(comm, folder / "model.h5", "model").weights
     assert sorted(map(float, weights.values())) == [1, 1, 2]  # c in units of the fluid's, alpha, beta
     simulate(comm, folder, *SMOOTHED, "simulation.turnovers=0.04")
     if comm.rank == 0:

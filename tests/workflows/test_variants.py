@@ -274,7 +274,7 @@ def test_realisations_that_no_training_has_seen(comm, folder, monkeypatch):
         for where in ("", "realisation-5/", "realisation-6/")]
     assert (out / "longer-steps/model.h5").resolve() == out / "learned/model.h5"
     assert not (out / "learned/rollout.h5").exists()
-    weights = [load_weights(alone, path, "model")[1] for path in out.glob("**/model.h5")]
+    weights = [load_weights(alone, path, "model").weights for path in out.glob("**/model.h5")]
     assert all(np.array_equal(one[name], values) for one in weights for name, values in weights[0].items())
     record, rows = rows_of(out)
     (summary,) = (sentence for sentence in record["summary"] if "the velocity error of" in sentence)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,18 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.io.hdf5 import ProductError, create_product, in_files, open_product, read_table, write_table
-from eddies.io.provenance import read_json
+from eddies.io.provenance import read_json, read_provenance
+
+
+@dataclass(frozen=True)
+class StoredWeights:
+    """The content of a file of trained weights: a description, tensors and tables by name, and its provenance."""
+
+    path: Path
+    description: dict[str, Any]
+    weights: dict[str, np.ndarray]
+    tables: dict[str, dict[str, np.ndarray]]
+    provenance: dict[str, Any]
 
 
 def save_weights(comm: MPI.Comm, path: str | Path, kind: str, description: Mapping[str, Any],
@@ -32,17 +44,13 @@ def save_weights(comm: MPI.Comm, path: str | Path, kind: str, description: Mappi
     in_files(comm, Path(path), write)
 
 
-def load_weights(comm: MPI.Comm, path: str | Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Description and tensors of a product, on all ranks; collective. ProductError also if a tensor is not finite."""
+def load_weights(comm: MPI.Comm, path: str | Path, kind: str) -> StoredWeights:
+    """Read what `save_weights` wrote, on all ranks; collective. ProductError also if a tensor is not finite."""
     with open_product(comm, path, kind) as file:
-        description, tensors = read_json(file, "description"), read_table(file, "weights")
-    for name, tensor in tensors.items():
+        tables = {name: read_table(file, name) for name in file if name != "weights"}
+        stored = StoredWeights(Path(path), read_json(file, "description"), read_table(file, "weights"), tables,
+                               read_provenance(file))
+    for name, tensor in stored.weights.items():
         if not np.isfinite(tensor).all():
             raise ProductError(f"{path}: tensor {name} holds values that are not finite; train again")
-    return description, tensors
-
-
-def load_tables(comm: MPI.Comm, path: str | Path) -> dict[str, dict[str, np.ndarray]]:
-    """The tables saved with the weights, by name, on all ranks; collective."""
-    with open_product(comm, path, None) as file:
-        return {name: read_table(file, name) for name in file if name != "weights"}
+    return stored

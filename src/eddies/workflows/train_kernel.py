@@ -13,8 +13,7 @@ from torch import nn
 
 from eddies.analysis.lagrangian import evenly
 from eddies.io.checkpoint import Guard
-from eddies.io.provenance import product_provenance
-from eddies.io.weights import load_tables, load_weights, save_weights
+from eddies.io.weights import load_weights, save_weights
 from eddies.learning.kernel_training import KernelSample, KernelTrainer
 from eddies.learning.training import Phase, Training
 from eddies.parallel.communicator import Comm
@@ -90,11 +89,11 @@ def keep_form(comm: Comm, path: Path, form: str | None, provenance: Mapping[str,
 
     Weights, tables and the id of the file do not change.
     """
-    description, weights = load_weights(comm, path, "kernel")
-    if description.get("reconstruction", "average") != form:
-        origin = {**provenance, "id": product_provenance(path).get("id")}
-        save_weights(comm, path, "kernel", {**description, "reconstruction": form}, weights, origin,
-                     load_tables(comm, path))
+    stored = load_weights(comm, path, "kernel")
+    if stored.description.get("reconstruction", "average") != form:
+        origin = {**provenance, "id": stored.provenance.get("id")}
+        save_weights(comm, path, "kernel", {**stored.description, "reconstruction": form}, stored.weights, origin,
+                     stored.tables)
         log.info('train-kernel: %s now has form = "%s"', path, form)
 
 

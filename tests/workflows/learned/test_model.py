@@ -59,7 +59,7 @@ def test_a_model_is_read_as_it_was_saved_for_the_scales_of_another_flow(comm, tm
                for name, tensor in model.state_dict().items())
     assert loaded.flow.cutoff == pytest.approx(2 * model.flow.cutoff)
     assert loaded.flow.scales == other and all(term.flow is loaded.flow for term in loaded.terms.values())
-    assert load_weights(comm, path, "model")[0]["scales"] == SCALES.to_dict()
+    assert load_weights(comm, path, "model").description["scales"] == SCALES.to_dict()
 
 
 @pytest.mark.mpi(2)

@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from eddies.io.weights import save_weights
+from eddies.io.weights import StoredWeights, save_weights
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.flow_units import ReferenceScales
 from eddies.particles.particle_set import ParticleSet
 from eddies.scene.scene import BOX_LENGTH, load_scene
 from eddies.workflows.learned.model import initial_model, load_model
-from eddies.workflows.learned.source import ModelDefinition, ModelSource
+from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.learned.transfer import trained_on
 from tests.small_scene import TINY
 
@@ -54,7 +54,7 @@ def test_the_same_flow_in_other_units_gets_the_same_force_in_those_units(comm, t
 
 
 def source_of(provenance, tables):
-    return ModelSource(Path("model.h5"), {}, {}, tables, provenance)
+    return StoredWeights(Path("model.h5"), {}, {}, tables, provenance)
 
 
 def test_the_run_in_which_weights_were_trained_is_kept_from_run_to_run():

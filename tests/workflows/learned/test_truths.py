@@ -9,7 +9,6 @@ import pytest
 import torch
 from mpi4py import MPI
 
-from eddies.io.hdf5 import open_product, read_table
 from eddies.io.provenance import product_attributes, product_provenance
 from eddies.io.weights import load_weights
 from eddies.particles.exchanges import relative_error
@@ -93,10 +92,8 @@ def trained_on(scene, *directories):
 
 def weights_and_errors(scene, comm, directory):
     train.run(scene, comm, directory)
-    path = directory / "model.h5"
-    with open_product(comm, path, "model") as file:
-        tables = {name: read_table(file, name) for name in ("history", "a_priori")}
-    return load_weights(comm, path, "model")[1], tables
+    stored = load_weights(comm, directory / "model.h5", "model")
+    return stored.weights, stored.tables
 
 
 def copied(source, target):

@@ -92,18 +92,18 @@ def load_model(definition: ModelDefinition, comm: Comm, path: str | Path, scales
 
     Raises ProductError if the file cannot be read or holds weights of another model.
     """
-    description, weights = load_weights(comm, path, "model")
-    for key, wanted, trained in definition.differences(description):
+    stored = load_weights(comm, path, "model")
+    for key, wanted, trained in definition.differences(stored.description):
         raise ProductError(f"{path}: was trained with {key} = {trained}, but the scene has {wanted}; run "
                            f"`eddies train` again, or set {key} = {trained}")
     model = initial_model(definition, scales, comm)
     expected = {name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}
-    if expected != {name: tensor.shape for name, tensor in weights.items()}:
+    if expected != {name: tensor.shape for name, tensor in stored.weights.items()}:
         raise ProductError(f"{path}: its parameters do not fit the present terms; remove it and run `eddies train` "
                            "again")
-    precision = next((tensor.dtype.name for tensor in weights.values()), "float64")
+    precision = next((tensor.dtype.name for tensor in stored.weights.values()), "float64")
     model.to(getattr(torch, precision))
-    model.load_state_dict({name: torch.from_numpy(np.asarray(tensor)) for name, tensor in weights.items()})
+    model.load_state_dict({name: torch.from_numpy(np.asarray(tensor)) for name, tensor in stored.weights.items()})
     return model
 
 
@@ -119,7 +119,8 @@ def load_form(comm: Comm, path: str | Path, scales: ReferenceScales, device: tor
     The kernel is a table in single precision. Raises ProductError if the file cannot be read, or was trained with
     another formula of the kernel.
     """
-    description, tensors = load_weights(comm, path, "kernel")
+    stored = load_weights(comm, path, "kernel")
+    description = stored.description
     network = KernelNetwork(description["support"], description["hidden"], description["cutoff"],
                             mean_volume=description.get("mean_volume"))
     formula = description.get("form", "NN g")
@@ -128,7 +129,7 @@ def load_form(comm: Comm, path: str | Path, scales: ReferenceScales, device: tor
                            f'"{network.formula}" for these settings: remove the file and run '
                            "`eddies train-kernel` again")
     network = network.to(dtype=torch.float32, device=device)
-    network.load_state_dict({name: torch.from_numpy(tensor) for name, tensor in tensors.items()})
+    network.load_state_dict({name: torch.from_numpy(tensor) for name, tensor in stored.weights.items()})
     with torch.no_grad():
         kernel = network.table()
     return Form(description.get("reconstruction", "average"), kernel, scales.filter_width, scales.spacing**3)

@@ -6,15 +6,11 @@ import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, asdict, dataclass, fields
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from eddies.import_path import short_name
-from eddies.io.hdf5 import ProductError, open_product
-from eddies.io.provenance import read_provenance
-from eddies.io.weights import load_tables, load_weights
+from eddies.io.hdf5 import ProductError
+from eddies.io.weights import StoredWeights, load_weights
 from eddies.parallel.communicator import Comm
 from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.scene.rules import quoted
@@ -83,18 +79,7 @@ class ModelDefinition:
             yield "[tracers] filter_width", f"{self.tracers.filter_width:.9g}", f"{width:.9g}"
 
 
-@dataclass(frozen=True)
-class ModelSource:
-    """Content of a model.h5: description, weights and tables by name, and provenance."""
-
-    path: Path
-    description: dict[str, Any]
-    weights: dict[str, np.ndarray]
-    tables: dict[str, dict[str, np.ndarray]]
-    provenance: dict[str, Any]
-
-
-def read_source(scene: Scene, comm: Comm) -> ModelSource:
+def read_source(scene: Scene, comm: Comm) -> StoredWeights:
     """Read the trained model that [model] path names; all ranks call it.
 
     Raises:
@@ -103,13 +88,10 @@ def read_source(scene: Scene, comm: Comm) -> ModelSource:
     """
     path = scene.model.weights_file
     try:
-        description, weights = load_weights(comm, path, "model")
-        with open_product(comm, path, "model") as file:
-            provenance = read_provenance(file)
-        tables = load_tables(comm, path)
+        source = load_weights(comm, path, "model")
     except ProductError as error:
         raise ProductError(f"{scene.name}: [model] path = {quoted(scene.model.path)}: {error}") from None
-    for key, wanted, trained in ModelDefinition.of(scene).differences(description):
+    for key, wanted, trained in ModelDefinition.of(scene).differences(source.description):
         raise SceneError(f"{scene.name}: {key} = {wanted}, but {path} was trained with {trained}; set "
                          f"{key} = {trained}, or give another [model] path")
-    return ModelSource(path, description, weights, tables, provenance)
+    return source

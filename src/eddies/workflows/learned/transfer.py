@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from eddies.io.provenance import others_trained_on
-from eddies.io.weights import save_weights
+from eddies.io.weights import StoredWeights, save_weights
 from eddies.parallel.communicator import Comm
 from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
@@ -19,7 +19,7 @@ from eddies.workflows.ground_truth.frame_counts import last_seen
 from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.learned.a_priori import evaluate, evaluation_frames
 from eddies.workflows.learned.model import load_model
-from eddies.workflows.learned.source import ModelDefinition, ModelSource, read_source
+from eddies.workflows.learned.source import ModelDefinition, read_source
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 
 log = logging.getLogger("eddies")
@@ -57,7 +57,7 @@ def run(scene: Scene, comm: Comm, directory: Path) -> None:
              "; ".join(beside))
 
 
-def trained_on(source: ModelSource, path: str) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:
+def trained_on(source: StoredWeights, path: str) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:
     """The origin of the weights of a source, and the a-priori errors on the flow of the training.
 
     The origin has `path` and `mach_turbulent` of the run that trained the weights. A source that took its weights from

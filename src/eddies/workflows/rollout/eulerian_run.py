@@ -167,8 +167,8 @@ def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float, dire
     length Delta is pi/k_c. `damping` names the parameter in the directory's model.h5 that a learned closure takes.
     """
     def learned() -> Closure:
-        _, weights = load_weights(grid.decomposition.comm, directory / STAGES["train"].file, "model")
-        return EddyDamping(grid, weights[f"terms.{damping}"])
+        stored = load_weights(grid.decomposition.comm, directory / STAGES["train"].file, "model")
+        return EddyDamping(grid, stored.weights[f"terms.{damping}"])
 
     width = filter_width or math.pi / grid.cutoff
     made = {
