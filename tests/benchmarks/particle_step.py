@@ -76,7 +76,7 @@ class Run:
         tracers = Tracers(particles_per_side=side, turnovers=1.0, frame_interval=1.0)
         width = 2 * tracers.spacing
         grid, modes = filtered_velocity(comm, side, width)
-        scales = turbulence_scales(energy_spectrum(grid, modes)[1], 0.0, 0.0, grid.cutoff)
+        scales = turbulence_scales(energy_spectrum(grid, modes), 0.0, 0.0, grid.cutoff)
         self.speed, self.turnover = scales["velocity_rms"], scales["eddy_turnover_time"]
         slab = SlabDecomposition(comm, 2 * math.pi, tracers.planes)
         columns = release(slab, 1, side**3, "random")

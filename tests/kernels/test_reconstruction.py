@@ -37,7 +37,7 @@ def averages(field, kernel):
 def averages_by_torch(field, kernel):
     at_points, at_particles = (field._neighbors_of(points).pairs(points, field._position, dtype=field.dtype)
                                for points in (field.points, field.owned))
-    volume = with_ghosts(field.halo, 1 / at_particles.sum(kernel.value(at_particles.distance)))
+    volume = with_ghosts(field.halo, 1 / at_particles.sum(kernel.value(at_particles.distance)[None])[0])
     on_grid, on_particles = (reconstruct_with_gradient(kernel, pairs, volume, field._velocity)
                              for pairs in (at_points, at_particles))
     return [volume, on_grid[0], *on_grid, *on_particles]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from eddies.kernels.copies import ColumnCopies, PlaneCopies
+from eddies.kernels.copies import ColumnCopies, Described, PlaneCopies
 from eddies.kernels.kriging import kriging_weights
 from eddies.kernels.library import instruction_sets, load
 from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand
@@ -28,8 +28,8 @@ def copied(library):
     planes, columns = (kind(library, *size) for kind in (PlaneCopies, ColumnCopies))
     arrays = [noise(1, complex, 2, 4, 95, 48), noise(2, complex, 2, 144, 98), noise(3, complex, 144, 20, 48),
               noise(4, complex, 1, 95, 40, 48), noise(5, complex, 95)]
-    blocks, column = planes.described_blocks(arrays[:1]), columns.described(arrays[2])
-    rows, kept, factors = map(planes.described, (arrays[1], *arrays[3:]))
+    blocks = planes.described_blocks(arrays[:1])
+    rows, column, kept, factors = map(Described, arrays[1:])
     arrays.append(planes.pack(blocks, slice(0, 4)))
     for _ in planes.filled(arrays[-1], noise(5, complex, 1, 1, 95, 1), rows):
         planes.unpack(rows, blocks, 1, slice(0, 4))

@@ -54,7 +54,7 @@ def developed_flows(grid):
 
 def errors(grid, state, reference):
     """Relative L2 differences of density fluctuation, energy spectrum and velocity."""
-    spectra = [energy_spectrum(grid, velocity[:3])[1][1:grid.cutoff + 1] for velocity in (state, reference)]
+    spectra = [energy_spectrum(grid, velocity[:3])[1:grid.cutoff + 1] for velocity in (state, reference)]
     found, true = (np.exp(grid.backward(values[3:])) for values in (state, reference))
     density = grid.mean((found - true) ** 2) / grid.mean((true - grid.mean(true)) ** 2)
     velocity = power(grid, (state - reference)[:3]) / power(grid, reference[:3])

@@ -106,7 +106,7 @@ class FlowHistory:
         else:
             row = incompressible_budget(grid, velocity, fluid.viscosity)
             row["skewness"], row["flatness"] = gradient_moments(grid, velocity)
-        _, spectrum = energy_spectrum(grid, velocity)
+        spectrum = energy_spectrum(grid, velocity)
         row["energy"] = float(spectrum.sum())
         row |= component_energies(grid, velocity)
         row |= turbulence_scales(spectrum, row["dissipation_rate"], fluid.viscosity, grid.cutoff)

@@ -35,7 +35,7 @@ def _gaussian_solenoidal(grid: SpectralGrid, seed: int) -> tuple[np.ndarray, np.
     """Return a solenoidal velocity with normally distributed modes and zero mean, and its spectrum."""
     velocity = grid.solenoidal(_gaussian_modes(grid, seed))
     velocity[:, grid.index_squared == 0] = 0
-    return velocity, energy_spectrum(grid, velocity)[1]
+    return velocity, energy_spectrum(grid, velocity)
 
 
 def _with_spectrum(grid: SpectralGrid, velocity: np.ndarray, energy: np.ndarray, target: np.ndarray) -> np.ndarray:

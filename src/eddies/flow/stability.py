@@ -134,7 +134,7 @@ class StabilityWatch:
 
     def __init__(self, fluid: Fluid, stepper: Callable, history: Any) -> None:
         self.fluid, self.stepper, self.history = fluid, stepper, history
-        self._ceiling = math.inf
+        self._ceiling: float | None = None  # before the first step
 
     def __call__(self, before: np.ndarray, after: np.ndarray, step: float, clock: Clock) -> None:
         """Raise FlowDiverged if the step from the state `before` to the state `after` was unstable.
@@ -142,7 +142,7 @@ class StabilityWatch:
         A step is unstable if the energy then exceeds GROWTH times the available energy. The available energy is the
         smallest energy so far plus the energy injected since then.
         """
-        if self._ceiling == math.inf:
+        if self._ceiling is None:
             self._ceiling = quadratic_energy(self.fluid, before)
         if self.fluid.forcing is not None:
             self._ceiling += step * self.fluid.forcing.injection_rate
@@ -166,7 +166,7 @@ class StabilityWatch:
 
     def state_dict(self) -> dict[str, float | None]:
         """Return the available energy, for a checkpoint; None before the first step."""
-        return {"ceiling": self._ceiling if math.isfinite(self._ceiling) else None}
+        return {"ceiling": self._ceiling}
 
     def load_state_dict(self, state: dict[str, float | None]) -> None:
-        self._ceiling = math.inf if state["ceiling"] is None else state["ceiling"]
+        self._ceiling = state["ceiling"]

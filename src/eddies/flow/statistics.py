@@ -6,12 +6,12 @@ from eddies.parallel.reduction import global_sum
 from eddies.spectral.spectral_grid import SpectralGrid
 
 
-def energy_spectrum(grid: SpectralGrid, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return k = 0, 1, ... and E(k), the energy of the modes whose |k| rounds to k; sum E = <u.u>/2."""
+def energy_spectrum(grid: SpectralGrid, velocity: np.ndarray) -> np.ndarray:
+    """Return E(k) for k = 0, 1, ..., the energy of the modes whose |k| rounds to k; sum E = <u.u>/2."""
     shells = int(np.ceil(np.sqrt(3) * grid.cutoff)) + 1
     density = 0.5 * grid.multiplicity * (np.abs(velocity) ** 2).sum(axis=0)
     spectrum = np.bincount(grid.shell_number.ravel(), density.ravel().astype(float), minlength=shells)
-    return np.arange(shells), global_sum(grid.decomposition.comm, spectrum)
+    return global_sum(grid.decomposition.comm, spectrum)
 
 
 def component_energies(grid: SpectralGrid, velocity: np.ndarray) -> dict[str, float]:

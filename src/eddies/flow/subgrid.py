@@ -140,8 +140,7 @@ class SpectralViscosity(ModeDamping):
         super().__init__(grid, PLATEAU * (1 + CUSP * np.exp(-STEEPNESS * grid.cutoff / k)) * grid.wavenumber_squared)
 
     def begin_step(self, velocity: np.ndarray) -> None:
-        _, energy = energy_spectrum(self.grid, velocity)
-        self.amplitude = np.sqrt(energy[self.grid.cutoff] / self.grid.cutoff)
+        self.amplitude = np.sqrt(energy_spectrum(self.grid, velocity)[self.grid.cutoff] / self.grid.cutoff)
 
 
 class EddyDamping(ModeDamping):

@@ -1,8 +1,8 @@
 """Copies before and after the one-dimensional passes of a slab transform.
 
 Along an axis of `cells` points a transform keeps the modes 0 ... K at the beginning of its array and -K ... -1 at the
-end. The gap between them stays zero. Arrays that are used many times are passed to `described` once, because numpy
-returns addresses slowly. Arrays must be contiguous and of the given precision; ValueError otherwise.
+end. The gap between them stays zero. Arrays that are used many times are `Described` once, because numpy returns
+addresses slowly. Arrays must be contiguous and of the given precision; ValueError otherwise.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class _Blocks(ctypes.Structure):
         super().__init__(len(blocks), *self.shape[1:], *(array.ctypes.data for array in self._kept[1:]))
 
 
-class _Array:
+class Described:
     """An array with its address, shape and strides.
 
     The array must be contiguous or, with `gaps`, each of its parts along the first axis. `apart` is the number of
@@ -58,9 +58,6 @@ class _Copies:
     def described_blocks(self, blocks: Sequence[np.ndarray]) -> _Blocks:
         return _Blocks(blocks, self.exchanged_axis, self._dtype)
 
-    def described(self, array: np.ndarray, gaps: bool = False) -> _Array:
-        return _Array(array, gaps)
-
     def _function(self, name: str, *arguments: type) -> Callable[..., None]:
         precision = "float64" if self._dtype == np.complex128 else "float32"
         function = getattr(self._library, f"copies_{name}_{precision}")
@@ -84,31 +81,31 @@ class ColumnCopies(_Copies):
         self._send = self._function("send_column", ADDRESS, *4 * [INT], ADDRESS)
         self._receive = self._function("receive_column", ADDRESS, *4 * [INT], ADDRESS)
 
-    def fill(self, modes: _Array, component: int, rows: slice, factors: _Array | None, column: _Array) -> None:
+    def fill(self, modes: Described, component: int, rows: slice, factors: Described | None, column: Described) -> None:
         """Copy the modes of a component at some `rows` to a column. Factors (kz), if given, multiply the modes."""
         sizes, start = self._sizes(modes, component, rows, column)
         self._fill(*sizes, start, None if factors is None else factors.address, column.address)
 
-    def store(self, column: _Array, scale: float, modes: _Array, component: int, rows: slice) -> None:
+    def store(self, column: Described, scale: float, modes: Described, component: int, rows: slice) -> None:
         """Copy a column, multiplied by `scale`, to the modes of a component at some `rows`."""
         sizes, start = self._sizes(modes, component, rows, column)
         self._store(*sizes, column.address, scale, start)
 
-    def send(self, column: _Array, blocks: _Blocks, component: int, rows: slice) -> None:
+    def send(self, column: Described, blocks: _Blocks, component: int, rows: slice) -> None:
         """Copy a column to blocks."""
         self._exchange(self._send, column, blocks, component, rows)
 
-    def receive(self, blocks: _Blocks, component: int, rows: slice, column: _Array) -> None:
+    def receive(self, blocks: _Blocks, component: int, rows: slice, column: Described) -> None:
         """Copy blocks to a column."""
         self._exchange(self._receive, column, blocks, component, rows)
 
-    def _sizes(self, modes: _Array, component: int, rows: slice, column: _Array) -> tuple[tuple[int, ...], int]:
+    def _sizes(self, modes: Described, component: int, rows: slice, column: Described) -> tuple[tuple[int, ...], int]:
         """Sizes for the library, and the address of the rows in the modes."""
         _, _, lines, width = modes.shape
         start = modes.address + component * modes.strides[0] + rows.start * modes.strides[2]
         return (self._cutoff, self._cells, lines * width, column.shape[1] * width, column.apart), start
 
-    def _exchange(self, function: Callable[..., None], column: _Array, blocks: _Blocks, component: int,
+    def _exchange(self, function: Callable[..., None], column: Described, blocks: _Blocks, component: int,
                   rows: slice) -> None:
         function(ctypes.byref(blocks), component, rows.start, rows.stop - rows.start, column.apart, column.address)
 
@@ -139,7 +136,7 @@ class PlaneCopies(_Copies):
         self._pack(ctypes.byref(blocks), components, planes.start, count, _address(packed))
         return packed
 
-    def filled(self, part: np.ndarray, factors: np.ndarray | None, rows: _Array) -> Iterator[None]:
+    def filled(self, part: np.ndarray, factors: np.ndarray | None, rows: Described) -> Iterator[None]:
         """Copy packed modes to `rows` (pairs, y, x), the input of the transform along y, one component per iteration.
 
         Factors (1, 1, ky, 1) or (1, 1, 1, kx), if given, multiply the modes.
@@ -157,22 +154,22 @@ class PlaneCopies(_Copies):
                        rows.address)
             yield
 
-    def unpack(self, rows: _Array, blocks: _Blocks, component: int, planes: slice) -> None:
+    def unpack(self, rows: Described, blocks: _Blocks, component: int, planes: slice) -> None:
         """Store the modes of some `planes`, found in the output `rows` of the transform along y, in a component of
         blocks. The stored values are twice the modes."""
         self._unpack(ctypes.byref(blocks), component, planes.start, planes.stop - planes.start, self._cells,
                      rows.shape[-1], rows.address)
 
-    def split(self, complex_planes: _Array, real: _Array, component: int, planes: slice) -> None:
+    def split(self, complex_planes: Described, real: Described, component: int, planes: slice) -> None:
         """Copy complex planes (pairs, y, x) to some real planes of fields (c, planes, y, x)."""
         self._split(*self._halves(complex_planes, real, component, planes))
 
-    def join(self, real: _Array, component: int, planes: slice, complex_planes: _Array) -> None:
+    def join(self, real: Described, component: int, planes: slice, complex_planes: Described) -> None:
         """Copy some real planes of fields (c, planes, y, x) to complex planes (pairs, y, x)."""
         points, place, f, g = self._halves(complex_planes, real, component, planes)
         self._join(points, f, g, place)
 
-    def _halves(self, complex_planes: _Array, real: _Array, component: int, planes: slice) -> tuple[int, ...]:
+    def _halves(self, complex_planes: Described, real: Described, component: int, planes: slice) -> tuple[int, ...]:
         """Number of points; addresses of the complex planes and of the first and second half of the real planes."""
         count, (pairs, y, x) = planes.stop - planes.start, complex_planes.shape
         f = real.address + component * real.strides[0] + planes.start * real.strides[1]

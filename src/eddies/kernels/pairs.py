@@ -29,15 +29,6 @@ class Summand:
     scalar: int = 0
 
 
-def kinds(library: ctypes.CDLL) -> list[str]:
-    """Names of the summands in the library."""
-    library.pair_summand.restype = ctypes.c_char_p
-    names: list[str] = []
-    while name := library.pair_summand(INT(len(names))):
-        names.append(name.decode())
-    return names
-
-
 @dataclass(frozen=True)
 class PairSpace:
     """The box of the pairs, the distance `radius` within which two particles are a pair, and the units of the summands.

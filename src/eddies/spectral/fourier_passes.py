@@ -15,7 +15,7 @@ import numpy as np
 import pyfftw
 
 from eddies.cores import threads
-from eddies.kernels.copies import ColumnCopies, PlaneCopies
+from eddies.kernels.copies import ColumnCopies, Described, PlaneCopies
 from eddies.kernels.library import library
 
 BLOCK_BYTES = 2**18  # size of a block per component and thread: a few blocks fit the second-level cache of a core
@@ -29,11 +29,11 @@ Part = np.ndarray | tuple[np.ndarray, np.ndarray]
 
 
 class ColumnPlan(NamedTuple):
-    """Plan along z, and its input and output (z, rows, x) in the form that `ColumnPass.copies` takes."""
+    """Plan along z, and its input and output (z, rows, x)."""
 
     plan: pyfftw.FFTW
-    given: Any
-    result: Any
+    given: Described
+    result: Described
 
 
 class ColumnPass:
@@ -55,8 +55,7 @@ class ColumnPass:
         if key not in self._plans:
             given, result = (self._zeros(key[1]) for _ in range(2))
             plan = _plan(given, result, 0, direction)
-            described = (self.copies.described(column, gaps=True) for column in (given, result))
-            self._plans[key] = ColumnPlan(plan, *described)
+            self._plans[key] = ColumnPlan(plan, *(Described(column, gaps=True) for column in (given, result)))
         return self._plans[key]
 
     def _zeros(self, rows: int) -> np.ndarray:
@@ -69,13 +68,13 @@ class PlanePlans(NamedTuple):
     """Plans for pairs of planes, and their memory.
 
     `rows` (pairs, y, kx) is transformed along y; all fields use it, one after the other. Its dropped modes stay zero,
-    because no plan writes to its input. `planes` holds the complex planes (pairs, y, x) of each field. `rows` and
-    `planes` have the form that `PlanePass.copies` takes. `values` (fields, pairs, y, 2 x) are the same planes as real
-    numbers, with the two values of a point side by side. `plans` lists the plans of each field in order of execution.
+    because no plan writes to its input. `planes` holds the complex planes (pairs, y, x) of each field. `values`
+    (fields, pairs, y, 2 x) are the same planes as real numbers, with the two values of a point side by side. `plans`
+    lists the plans of each field in order of execution.
     """
 
-    rows: Any
-    planes: list[Any]
+    rows: Described
+    planes: list[Described]
     values: np.ndarray
     plans: list[list[pyfftw.FFTW]]
 
@@ -151,8 +150,7 @@ class PlanePass:
         else:
             along_y = [_plan(b, a, 1, direction) for a, b in kept]
             plans = [[_plan(field, lines, 2, direction), *along_y] for field in planes]
-        described = self.copies.described
-        return PlanePlans(described(rows), [described(field) for field in planes], values, plans)
+        return PlanePlans(Described(rows), list(map(Described, planes)), values, plans)
 
     def _values(self, fields: int, pairs: int) -> np.ndarray:
         """Return zeros (fields, pairs, y, 2 x) with the fields an odd number of cache lines apart.

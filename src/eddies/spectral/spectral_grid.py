@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from eddies.kernels.copies import Described
 from eddies.kernels.library import require
 from eddies.parallel.migration import Redistribution
 from eddies.parallel.reduction import global_sum
@@ -102,7 +103,7 @@ class SpectralGrid(ModeOperators):
         """Return the real field (c, z_local, y, x) of modes (c, kz, ky_local, kx); the inverse of `forward`."""
         physical = np.empty((len(spectral), *self.physical_shape), self.real)
         copies = self.plane_pass.copies
-        result = copies.described(physical)
+        result = Described(physical)
         for planes, packed in self._packed_blocks(spectral):
             for component in range(len(physical)):
                 plans = self.plane_pass.to_physical([packed[component : component + 1]], 1, planes)
@@ -170,7 +171,7 @@ class SpectralGrid(ModeOperators):
         components, copies = len(spectral), self.column_pass.copies
         batch = self._batch("backward", components + z_derivatives)
         modes = self._described(spectral, self.complex, self.spectral_shape)
-        d_dz = copies.described((1j * self.wavevector[2].ravel()).astype(self.complex))
+        d_dz = Described((1j * self.wavevector[2].ravel()).astype(self.complex))
         fields = [(component, None) for component in range(components)]
         fields += [(component, d_dz) for component in range(z_derivatives)]
         for rows in self.column_pass.rows(self.spectral_shape[1]):
@@ -182,18 +183,18 @@ class SpectralGrid(ModeOperators):
         batch.transpose.to_planes()
         return batch
 
-    def _described(self, array: np.ndarray, dtype: type, shape: tuple[int, ...]) -> Any:
-        """Return an array (c, *shape) in the form that the copies take. Raises ValueError for another shape."""
+    def _described(self, array: np.ndarray, dtype: type, shape: tuple[int, ...]) -> Described:
+        """Return the description of an array (c, *shape). Raises ValueError for another shape."""
         array = np.require(array, dtype, "CW")
         require(array, (len(array), *shape), dtype)
-        return self.plane_pass.copies.described(array)
+        return Described(array)
 
     def _planes_to_columns(self, components: int) -> np.ndarray:
         """Return the modes of the "forward" batch: redistribute its components to columns, transform them along z."""
         batch, copies = self._batch("forward", components), self.column_pass.copies
         batch.transpose.to_columns()
         spectral = np.empty((components, *self.spectral_shape), self.complex)
-        result = copies.described(spectral)
+        result = Described(spectral)
         for rows in self.column_pass.rows(self.spectral_shape[1]):
             column = self.column_pass.plan("FORWARD", rows)
             for component in range(components):

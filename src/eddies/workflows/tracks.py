@@ -221,8 +221,8 @@ class FrameFlow:
         whole, self.filtered = (modes * (1 / transfer), modes) if filtered else (modes, modes * transfer)
         among = grid.at(modes, grid.points(particles.position))
         square, count = global_sum(comm, np.array([float(among.square().sum()), len(particles.id)]))
-        share = square / count / (2 * energy_spectrum(grid.spectral, as_numpy(modes))[1].sum())
-        self.energy, self.filtered_energy = (share * energy_spectrum(grid.spectral, as_numpy(each))[1]
+        share = square / count / (2 * energy_spectrum(grid.spectral, as_numpy(modes)).sum())
+        self.energy, self.filtered_energy = (share * energy_spectrum(grid.spectral, as_numpy(each))
                                              for each in (whole, self.filtered))
 
     @torch.no_grad()

@@ -134,8 +134,8 @@ class TracerSet:
         modes = {"velocity": velocity} | ({"density": field.density_modes(state)} if compressible else {})
         planes = {name: grid.backward(regrid(field.grid, grid, part)) for name, part in modes.items()}
         segments.fields[f"filtered{self.suffix}"].append(time, grid.decomposition.start, planes)
-        for name, value in (("time", time), ("energy", energy_spectrum(field.grid, state[:3])[1]),
-                            ("filtered", energy_spectrum(field.grid, velocity)[1])):
+        for name, value in (("time", time), ("energy", energy_spectrum(field.grid, state[:3])),
+                            ("filtered", energy_spectrum(field.grid, velocity))):
             self.spectra[name].append(value)
 
     def scales(self, segments: FrameSegments) -> dict[str, float]:
