@@ -1,10 +1,13 @@
 """Scenes that must be refused, each with a part of the message that names the key, its value or the remedy."""
 
+from tests.small_scene import TINY
+
 FLOW = '[flow]\nfluid = "incompressible"\ncells = 16\nviscosity = 0.1\n'
 SOUND = FLOW.replace("incompressible", "compressible") + "sound_speed = 9\n"
 TIME = "[time]\nduration = 1\n"
 TRACERS = "[tracers]\nparticles_per_side = 8\nturnovers = 1\nframe_interval = 1\n"
 LEARNING = TRACERS + "[kernel]\nsteps = 3\n"
+HEAD = f'title = "a test"\nbase = "{TINY}"\nsimulation.turnovers = 0.25\n'
 MODEL = "[training]\nframes = 2\nbatch = 9\nsteps = 3\n[model]\n"
 
 BAD_TEXTS = [
@@ -39,6 +42,28 @@ BAD_TEXTS = [
     ('[tracks]\npath = "a.csv"\nformat = "cvs"\n', '[tracks] format = "cvs": must be one of "h5md"'),
     (FLOW + TIME + "realisations = [3]\n", "[time] realisations: no such key"),
     ("realisations = [3]\n" + FLOW + TIME, "realisations = [3]: the scene has no [simulation]"),
+    # Bases and variants.
+    ('base = "tine"\n', "base: tine: no such scene; did you mean tiny?"),
+    ("base = 3\n", "base = 3: must be the name or the path of a scene"),
+    ('base = "case.toml"\n', 'base = "case.toml": this scene is its own base'),
+    ('unset = ["forcing"]\n', "unset: there is no base to remove keys from"),
+    (HEAD + 'unset = "forcing"\n', 'unset = "forcing": must be a list of keys or sections'),
+    ('unset = ["forcng"]\n' + HEAD, "forcng: there is no such key or section to remove"),
+    (HEAD + "variant = 3\n", "variant: must be sections; write [variant.NAME]"),
+    (HEAD + '[variant."a/b"]\n', 'variant "a/b": name = "a/b": must be the name of a directory'),
+    (HEAD + "[variant.report]\n", 'variant "report": a run directory uses this name for something else'),
+    (HEAD + "[variant.checkpoints-train]\n", "a run directory uses this name for something else"),
+    (HEAD + "[variant.realisation-2]\n", "a run directory uses this name for something else"),
+    (HEAD + "[variant.a]\nmodel.pairs.hiden = [8]\n", "[model.pairs] hiden: no such key; did you mean hidden?"),
+    (HEAD + "[variant.a]\nsimulation.turnovers = 0.1\n", "[simulation] turnovers = 0.1 where the scene has 0.25"),
+    (HEAD + "[variant.a]\nkernel.form = 'linear'\n", '[kernel] form = "linear" where the scene has "kriging"'),
+    (HEAD + "[variant.a]\ntraining.window = 0.4\n", "[training] window = 0.4 where the scene has 0.5"),
+    (HEAD + "[varaint.a]\n", "[varaint]: no such section; did you mean variant?"),
+    ('bas = "tiny"\n', "bas: no such key; did you mean base?"),
+    (HEAD + "realisations = [3, 1]\n", "realisations = [3, 1]: 1 is the seed of the scene"),
+    (HEAD + "realisations = [3, 3]\n", "realisations = [3, 3]: 3 is given more than once"),
+    ('base = "taylor-green"\n[variant.a]\n', 'variant "a": variants are compared by their rollouts; add [simulation]'),
+    (HEAD + "[variant.a]\nrealisations = [3]\n", 'variant "a": realisations: a variant cannot change this key'),
 ]
 
 BAD_OVERRIDES = [

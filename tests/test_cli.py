@@ -25,9 +25,12 @@ def test_a_bad_value_ends_with_2_and_writes_nothing(comm, tmp_path, capfd):
     for override, message in BAD_OVERRIDES[::4]:
         refused(comm, capfd, ["run", TINY, "--set", override, "--output", tmp_path / "run"], message)
         assert not (tmp_path / "run").exists()
-    for number, (text, message) in enumerate(BAD_TEXTS[::6]):
-        path = tmp_path / f"bad-{number}.toml"
-        path.write_text(text)
+    for number, (text, message) in enumerate(BAD_TEXTS[::8]):
+        path = tmp_path / str(number) / "case.toml"
+        if comm.rank == 0:
+            path.parent.mkdir()
+            path.write_text(text)
+        comm.Barrier()
         refused(comm, capfd, ["check", path], f"eddies: error: {path}: ", message)
 
 

@@ -5,9 +5,9 @@ from dataclasses import fields, replace
 import pytest
 
 from eddies.scene.model import settings_class
-from eddies.scene.scene import Flow, Model, Scene, SceneError, Simulation, Time, load_scene
+from eddies.scene.scene import Flow, Model, Scene, Simulation, Time, load_scene
 from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS, Continuity, PairNetwork, Pressure, Stress
-from tests.small_scene import TINY
+from tests.small_scene import TINY, scene_error, scene_file
 
 LEARNING = """
 [tracers]
@@ -40,15 +40,11 @@ class Drag(Term):
 
 
 def read(tmp_path, text, *overrides):
-    path = tmp_path / "case.toml"
-    path.write_text(text)
-    return load_scene(path, overrides)
+    return load_scene(scene_file(tmp_path, text), overrides)
 
 
 def refused(message, make):
-    with pytest.raises(SceneError) as error:
-        make()
-    assert message in str(error.value), str(error.value)
+    assert message in scene_error(make)
 
 
 def test_without_terms_the_model_is_the_default_preset(tmp_path):
