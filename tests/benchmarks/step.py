@@ -1,6 +1,6 @@
 """Time of an ETDRK4 step of the compressible fluid and of its parts, each against a bound measured in the same run.
 
-    mpirun -n 2 .venv/bin/python tests/benchmarks/step.py [CELLS ...] [--precision float32] [--share-of RANKS] [--json]
+    mpirun -n 2 .venv/bin/python tests/benchmarks/step.py [CELLS ...] [--precision float32] [--share-of RANKS]
 
 Times of parts are means over the ranks and medians over the steps. A part that waits for another rank includes the
 wait. Below the table a JSON line has the median time of a step, without the first.
@@ -208,8 +208,7 @@ def measure(comm: MPI.Comm, watch: Stopwatch, cells: int, precision: str, steps:
         bounds["transposes"] = sent_bytes(grid) / ring_bandwidth(comm)
     bounds = {part: comm.allreduce(bound) / comm.size for part, bound in bounds.items()}
     return {"cells": cells, "precision": precision, "ranks": comm.size, "share_of": share_of,
-            "seconds_per_step": median(totals), "parts": seconds, "bounds": bounds, "sent_bytes": sent_bytes(grid),
-            "memory_bytes": 1024 * memory}
+            "seconds_per_step": median(totals), "parts": seconds, "bounds": bounds, "memory_bytes": 1024 * memory}
 
 
 def table(result: dict) -> str:
@@ -232,7 +231,6 @@ def main() -> None:
     parser.add_argument("--precision", nargs="+", choices=["float64", "float32"], default=["float64", "float32"])
     parser.add_argument("--steps", type=int, default=7)
     parser.add_argument("--share-of", type=int, default=0, metavar="RANKS", help="run one rank's share alone")
-    parser.add_argument("--json", action="store_true", help="print JSON lines with all numbers, no table")
     options = parser.parse_args()
     comm, watch = MPI.COMM_WORLD, Stopwatch()
     for part, functions in PARTS.items():
@@ -242,10 +240,9 @@ def main() -> None:
         for precision in options.precision:
             result = measure(comm, watch, cells, precision, options.steps, options.share_of)
             if comm.rank == 0:
-                if not options.json:
-                    print(table(result))
-                    result = {key: result[key] for key in ("cells", "precision", "ranks", "seconds_per_step")}
-                print(json.dumps(result), flush=True)
+                print(table(result))
+                print(json.dumps({key: result[key] for key in ("cells", "precision", "ranks", "seconds_per_step")}),
+                      flush=True)
 
 
 if __name__ == "__main__":

@@ -142,14 +142,6 @@ def test_a_model_pays_with_transposes_for_the_terms_that_it_has_alone(comm):
 
 
 @pytest.mark.mpi(1)
-def test_a_model_without_pairs_has_neither_list_nor_ghosts(comm):
-    for terms, has_list, has_grid in ((PRESETS["resolved"], False, True), (PRESETS["resolved + pairs"], True, True),
-                                      (OWN_DENSITY, True, False), ({}, False, False), (FORCING, False, True)):
-        dynamics, _ = set_up(comm, terms)
-        assert (dynamics.neighborhood is not None, dynamics.resolution is not None) == (has_list, has_grid)
-
-
-@pytest.mark.mpi(1)
 def test_a_density_that_no_term_reads_is_neither_computed_nor_kept(comm):
     for terms in (PRESETS["resolved"], NO_DENSITY, {}):
         dynamics, particles = set_up(comm, terms, density=False)

@@ -27,7 +27,7 @@ class LinearForcing:
                  filter_width: float = 0.0) -> None:
         self.grid, self.injection_rate, self.wavenumber = grid, injection_rate, wavenumber
         self._checked = False
-        self.reach = reach = min(int(np.ceil(wavenumber)) - 1, grid.cutoff)
+        reach = min(int(np.ceil(wavenumber)) - 1, grid.cutoff)
         signed = np.arange(-reach, reach + 1)
         kx, ky, kz = np.arange(reach + 1)[None, None, :], signed[None, :, None], signed[:, None, None]
         squared = kx**2 + ky**2 + kz**2
