@@ -210,7 +210,7 @@ class Context:
         blocks = []
         for pairs in [self._pairs(self.rows)] if together else self.pairs_in_blocks(max(s.width for s in summands)):
             values = [_values(summand, pairs) for summand in summands]
-            blocks.append(pairs.pairs.sum(torch.cat(values).T).T)
+            blocks.append(pairs.pairs.sum(torch.cat(values)))
         return torch.cat(blocks, dim=1).split([len(value) for value in values])
 
     def _pairs(self, block: Tensor | slice | None) -> ScaledPairs:

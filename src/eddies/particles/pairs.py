@@ -54,10 +54,9 @@ class Pairs:
         return gather_rows(column, self.sender)
 
     def sum(self, values: Tensor) -> Tensor:
-        """Sum of pair values (m, ...) over the pairs of each output row, in a fixed order: (count, ...)."""
-        by_component = torch.atleast_2d(values.flatten(1).T if values.dim() > 1 else values).contiguous()
-        sums = _SegmentSum.apply(by_component, self.offsets, self.segment)
-        return sums.T.reshape(self.count, *values.shape[1:])
+        """Sum of pair values (components, m) over the pairs of each output row, in a fixed order: (components, count).
+        """
+        return _SegmentSum.apply(values, self.offsets, self.segment)
 
 
 def gather_rows(column: Tensor, index: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ def volumes(kernel: SmoothingKernel, pairs: Pairs) -> Tensor:
     if kernel.mean_volume is not None:
         return pairs.distance.new_full((pairs.count,), kernel.mean_volume)
     at_centre = kernel.value(pairs.distance.new_zeros(1))
-    return 1 / (at_centre + pairs.sum(kernel.value(pairs.distance)))
+    return 1 / (at_centre + pairs.sum(kernel.value(pairs.distance)[None])[0])
 
 
 def reconstruct(kernel: SmoothingKernel, pairs: Pairs, sender_volumes: Tensor, sender_values: Tensor) -> Tensor:
@@ -27,7 +27,7 @@ def reconstruct(kernel: SmoothingKernel, pairs: Pairs, sender_volumes: Tensor, s
     support. The volumes V (s,) and values A (s, components) are those of all local particles. A particle that is a
     receiver must be among its own neighbours.
     """
-    return _average(kernel, pairs, pairs.at_senders(sender_volumes), pairs.at_senders(sender_values).T)[0]
+    return _average(kernel, pairs, pairs.at_senders(sender_volumes), pairs.at_senders(sender_values).T)[0].T
 
 
 def reconstruct_with_gradient(kernel: SmoothingKernel, pairs: Pairs, sender_volumes: Tensor,
@@ -39,10 +39,9 @@ def reconstruct_with_gradient(kernel: SmoothingKernel, pairs: Pairs, sender_volu
     volume, value, distance = pairs.at_senders(sender_volumes), pairs.at_senders(sender_values).T, pairs.distance
     average, factor = _average(kernel, pairs, volume, value)
     gradient = volume * over_distance(kernel.derivative(distance), distance) * pairs.displacement.T
-    deviation = value - average.T.contiguous().index_select(1, pairs.segment)
-    products = deviation.unsqueeze(1) * gradient.unsqueeze(0)
-    sums = pairs.sum(products.flatten(0, 1).T).reshape(pairs.count, *products.shape[:2])
-    return average, sums * factor[:, :, None]
+    products = (value - average.index_select(1, pairs.segment)).unsqueeze(1) * gradient
+    sums = pairs.sum(products.flatten(0, 1)) * factor
+    return average.T, sums.unflatten(0, products.shape[:2]).permute(2, 0, 1)
 
 
 def normalisation(kernel: SmoothingKernel, denominator: Tensor) -> Tensor:
@@ -54,8 +53,8 @@ def normalisation(kernel: SmoothingKernel, denominator: Tensor) -> Tensor:
 
 
 def _average(kernel: SmoothingKernel, pairs: Pairs, volume: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
-    """Average (count, components) and normalisation (count, 1) from pair columns (m,) and (components, m)."""
+    """Average (components, count) and normalisation (1, count) from pair columns (m,) and (components, m)."""
     weight = volume * kernel.value(pairs.distance)
-    sums = pairs.sum(torch.cat([weight.unsqueeze(0), weight * value]).T)
-    factor = normalisation(kernel, sums[:, :1])
-    return sums[:, 1:] * factor, factor
+    sums = pairs.sum(torch.cat([weight.unsqueeze(0), weight * value]))
+    factor = normalisation(kernel, sums[:1])
+    return sums[1:] * factor, factor
