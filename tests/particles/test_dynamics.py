@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from eddies.parallel.halo import HaloError, HaloExchange
+from eddies.parallel.halo import HaloError
 from eddies.parallel.reduction import sum_flat
 from eddies.particles import context, neighborhood
 from eddies.particles.integrators import INTEGRATORS
@@ -95,30 +95,6 @@ def test_particles_that_cross_slabs_move_as_on_one_rank(comm, name, integrator, 
         assert slab.size == 1 or set(start.id.tolist()) != set(particles.id.tolist())
         ends.append(by_id(slab.comm, particles, particles.velocity, 150))
     assert_close(*ends, 1e-10)
-
-
-@pytest.mark.mpi(2)
-@pytest.mark.parametrize("name, shapes", [("without density", [(3,)]), ("pairs", [(), (3,)])])
-def test_only_columns_that_are_read_are_sent(comm, monkeypatch, name, shapes):
-    slab, particles = distributed(comm, *state())
-    dynamics = dynamics_of(slab, model(MODELS[name]))
-    dynamics.rates(particles)
-    sent = []
-
-    def record(name, method):
-        monkeypatch.setattr(HaloExchange, name,
-                            lambda halo, column: sent.append((name, column.shape[1:])) or method(halo, column))
-
-    for method in ("forward", "forward_positions"):
-        record(method, getattr(HaloExchange, method))
-    moved = replace(particles, position=particles.position.clone())
-    dynamics.rates(moved)
-    columns = [("forward", shape) for shape in shapes]
-    # The exchange of positions consists of one of rows.
-    assert sorted(sent) == sorted([("forward_positions", (3,)), ("forward", (3,)), *columns])
-    sent.clear()
-    dynamics.rates(replace(moved, velocity=2 * moved.velocity))  # the same positions
-    assert sorted(sent) == sorted(columns)
 
 
 @pytest.mark.mpi(1, 2)

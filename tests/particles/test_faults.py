@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from eddies.particles.faults import Limits, find_fault, find_unplaced
+from eddies.particles.faults import Limits, find_fault
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
 from tests.particles.configurations import LENGTH, state
@@ -38,16 +38,6 @@ def test_a_faulty_particle_is_described(name, value, complaint):
 
 def test_the_nearest_particle_is_found_across_the_faces():
     position = torch.tensor([[0.1, 1, 1], [3, 3, 3], [LENGTH - 0.2, 1, 1]], dtype=torch.float64)
-    particles = replace(sound(3), position=position)
+    particles = replace(sound(3), position=position, density=None)
     particles.velocity[0] = torch.nan
     assert "nearest particle 102 at a distance of 0.3" in fault(particles)
-
-
-@pytest.mark.parametrize("distance, complaint", [(torch.inf, "not finite"), (1.01 * LENGTH, "outside its slab")])
-def test_a_particle_far_from_its_slab_is_described(distance, complaint):
-    outside = torch.full((6,), LENGTH, dtype=torch.float64)
-    assert find_unplaced(sound(), outside, BOX, rank=3) is None
-    outside[4] = distance
-    for particles in (sound(), replace(sound(), density=None)):
-        description = find_unplaced(particles, outside, BOX, rank=3)
-        assert "rank 3, particle 104" in description and complaint in description

@@ -194,15 +194,6 @@ def test_the_frame_of_reference_changes_nothing(comm):
 
 
 @pytest.mark.mpi(2)
-def test_the_force_keeps_the_momentum_of_the_particles(comm):
-    """The force on the grid has a mean, since the particles do not sample it evenly."""
-    slab, particles, count = particles_around_a_void(comm)
-    force = by_id(comm, particles, dynamics_of(slab, lagrangian()).rates(particles).acceleration, count)
-    sizes = force.norm(dim=1).sum()
-    assert sizes > 1 and force.sum(0).abs().max() < 1e-12 * sizes
-
-
-@pytest.mark.mpi(2)
 def test_the_resolved_velocity_is_solenoidal_and_what_it_misses_is_the_rest(comm):
     slab, particles, count = particles_around_a_void(comm)
     flow = resolution_on(slab).of(particles)

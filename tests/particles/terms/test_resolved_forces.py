@@ -29,7 +29,6 @@ from tests.particles.configurations import (
 from tests.validation.filtered_fields import CELLS, WAVE, Filtered, at, fields_of, modes_of, random_velocity
 
 one_rank = pytest.mark.mpi(1)
-every_form = pytest.mark.parametrize("form", ["deconvolution", "gradient"])
 SIDE, RESOLVED = 18, 6
 
 
@@ -96,22 +95,6 @@ def test_pressure_and_density_of_known_vortices(comm):
     expected = SCALES.density_mean * (1 + torch.cos(x) * torch.cos(y) / SCALES.sound_speed**2)
     assert torch.allclose(rates.density, expected, atol=1e-14)
     assert set(given(evaluated(model(pressure={}, stress={}), vortices))) == {"acceleration"}  # no unused density
-
-
-@one_rank
-@every_form
-def test_stress_of_two_waves_at_an_angle(comm, form):
-    """A filter exp(-k^2 d^2 / 24) hides exp(-p.q d^2/12) - 1 of the product of waves p and q, to leading order
-    -p.q d^2/12. The waves of u = (sin(x + y), -sin(x + y), sin x) give T = tau_zx = -tau_zy with cos y, the difference,
-    and cos(2x + y), the sum; p.q = -1 and 1. The force is d_y T - d_x T along z, without a pressure."""
-    x, y, _ = points().T
-    h = SCALES.filter_width**2 / 12
-    apart, together = (math.expm1(h), math.expm1(-h)) if form == "deconvolution" else (h, -h)
-    expected = -(apart * torch.sin(y) + together * torch.sin(2 * x + y)) / 2
-    rates = evaluated(terms_of(["stress"], UNITS, stress=dict(form=form)),
-                      lambda x, y, z: (torch.sin(x + y), -torch.sin(x + y), torch.sin(x)))
-    assert torch.allclose(rates.acceleration, torch.stack([0 * x, 0 * x, expected], dim=1), atol=1e-13)
-    assert (rates.density - SCALES.density_mean).abs().max() < 1e-15
 
 
 def damping_unit(square, wavenumber):

@@ -12,7 +12,7 @@ from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.smoothing_kernels import CubicSpline
 from eddies.scene.terms import PRESETS
 from tests.particles.configurations import (
-    LENGTH, SCALES, alone, assert_close, by_id, by_torch, distributed, dynamics_of, given, lattice, model, rates, state,
+    LENGTH, SCALES, assert_close, by_id, by_torch, distributed, dynamics_of, given, lattice, model, rates, state,
     summed_density,
 )
 
@@ -137,43 +137,6 @@ def test_sound_has_the_frequency_c_k(comm):
     r = torch.linspace(0, FLOW.cutoff, 2001, dtype=torch.float64)
     left = float(torch.trapezoid(4 * math.pi * r * torch.sin(r) * CubicSpline(FLOW.cutoff).value(r), r))
     assert 0.88 < left < 0.95 and np.unwrap(phases)[-1] == pytest.approx(1.5 * math.pi * left, rel=0.02)
-
-
-@one_rank
-def test_parameters_are_recovered_from_trajectories(comm):
-    """Training through steps of the integrator, from values far off, finds the parameters of the trajectories."""
-    side, step, together = 5, 0.01, 2
-    scales = dict(spacing=LENGTH / side, support=2.3)
-    position = lattice(side, 0.2)
-    random = torch.from_numpy(np.random.default_rng(2).normal(0, 0.5, position.shape))
-    slab, particles = alone(position, 3 * torch.sin(position[:, [1, 2, 0]]) + random, ONES[: side**3])
-    stepper, states = INTEGRATORS["verlet"](dynamics_of(slab, sph(**scales), 0.0)), [particles]
-    with torch.no_grad():
-        for _ in range(18):
-            states.append(stepper.step(states[-1], step))
-    learned = sph(**scales, c=5.0, alpha=0.3, beta=0.5)  # in units of half of c
-    dynamics, term = dynamics_of(slab, learned, 0.0), learned.terms["wcsph"]
-    optimiser = torch.optim.LBFGS(term.parameters(), max_iter=25, tolerance_change=0, line_search_fn="strong_wolfe")
-
-    def velocity(particles):
-        return particles.velocity[torch.argsort(particles.id)]
-
-    def loss():
-        """Mean square error of the velocity after a few steps, relative to its change."""
-        optimiser.zero_grad()
-        total = 0.0
-        for start, end in zip(states[::8], states[together::8]):
-            stepper, particles = INTEGRATORS["verlet"](dynamics), start
-            for _ in range(together):
-                particles = stepper.step(particles, step)
-            error, change = velocity(particles) - velocity(end), velocity(end) - velocity(start)
-            total = total + error.square().sum() / change.square().sum()
-        total.backward()
-        return total
-
-    optimiser.step(loss)
-    learned = {name: value.item() for name, value in term.named_parameters()}
-    assert learned == pytest.approx({"sound_speed": 2.0, "alpha": 2.0, "beta": 2.0}, rel=0.01)
 
 
 # ---- transport velocity
