@@ -17,6 +17,7 @@ import eddies.cli
 import eddies.io.checkpoint
 import eddies.io.hdf5
 import eddies.parallel.halo
+import eddies.scene.scene
 import eddies.spectral.fourier_passes
 
 # The function that fails, and the number of the failing call. At each place the other ranks wait for this one.
@@ -26,6 +27,9 @@ PLACES = {
     "product": (eddies.io.hdf5, "frame_bytes", 15),  # before a collective write: the second frame
     "checkpoint": (eddies.io.checkpoint, "own_part", 45),  # half of the second checkpoint is written
 }
+
+KINDS = {"RuntimeError": RuntimeError, "MemoryError": MemoryError, "SystemExit": SystemExit,
+         "SceneError": eddies.scene.scene.SceneError}
 
 TINY = Path(__file__).parents[1] / "tiny.toml"
 SCENE = ["flow.cells=12", "tracers.particles_per_side=5", "tracers.field_cells=8", "spin_up.turnovers=0.01",
@@ -43,7 +47,7 @@ def break_at(owner, name, call, kind, directory):
             (directory / "broke").write_text(f"{time.time():.6f}")
             if kind.startswith("SIG"):
                 os.kill(os.getpid(), getattr(signal, kind))
-            raise {"RuntimeError": RuntimeError, "MemoryError": MemoryError}[kind]("reactor leak")
+            raise KINDS[kind]("reactor leak")
         return sound(*arguments)
 
     setattr(owner, name, broken)

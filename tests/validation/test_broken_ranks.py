@@ -18,7 +18,7 @@ SECONDS = 10  # from the fault to the end of the job
 
 # Place, kind, ranks, and whether the launcher starts the job.
 CASES = [("transform", "SIGKILL", 3, True), ("halo", "RuntimeError", 2, True), ("product", "MemoryError", 2, False),
-         ("checkpoint", "SIGSEGV", 2, False)]
+         ("checkpoint", "SIGSEGV", 2, False), ("halo", "SystemExit", 2, False), ("product", "SceneError", 2, True)]
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +52,8 @@ def test_a_broken_rank_ends_the_job(jobs, case):
     assert code != 0 and seconds < SECONDS
     if kind.startswith("SIG"):
         assert re.search(r"process rank 1 .* exited on signal", errors)
+    elif kind == "SceneError":  # a mistake of the user
+        assert code == 2 and "rank 1: eddies: error: reactor leak" in errors and "Traceback" not in errors
     else:
         assert f"rank 1: {kind}: reactor leak" in errors and re.search(r"rank 1: +File .*, in broken", errors)
         assert "rank 0: Traceback" not in errors
