@@ -8,7 +8,7 @@ import logging
 import os
 import time
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -74,9 +74,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     scene.check_variants(variants)
     scene.check_unseen(directory)
     planned, reported = steps(scene, stages, directory, variants), "report" in stages
-    for step in planned:
-        step.scene.check_stages(step.stages)
-    if not planned and not reported:
+    if not scene.variant or not planned and not reported:
         for each in [scene.variant[name] for name in variants] or [scene]:
             each.check_stages(stages)
     refused, warnings = problems(scene, Context(comm, stages, directory, variants, memory_of_node(comm)))
@@ -98,7 +96,19 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
         prepare_directory(scene.to_toml(), comm, directory)
         for warning in warnings if comm.rank == 0 else ():
             log.warning(warning)
-        failures = run_steps(planned, comm, directory, stop, overwrite, take_over)
+        failures: dict[str, str] = {}
+        for number, step in enumerate(planned, 1):
+            if step.variant in failures:
+                continue
+            if len(planned) > 1:
+                log.info("%s, part %d of %d: %s", step.directory, number, len(planned), ", ".join(step.stages))
+            inner = step.directory != directory  # with a lock of its own
+            with (recording_failure(failures, step.variant, step.directory, comm),
+                  working_in(comm, step.directory, stop, take_over) if inner else nullcontext()):
+                if inner:
+                    in_files(comm, step.directory, step.link)
+                    prepare_directory(step.scene.to_toml(), comm, step.directory)
+                run_step(step, comm, stop, overwrite)
         if reported:
             run_stage("report", (directory, comm, variants, stop), comm, directory, stop, False)
     if failures:
@@ -106,36 +116,22 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
             f"{name} ({failure})" for name, failure in failures.items()))
 
 
-def run_steps(planned: Sequence[Step], comm: Comm, directory: Path, stop: StopRequest, overwrite: bool,
-              take_over: bool) -> dict[str, str]:
-    """Run steps in a run directory whose lock is held. Returns the error of each failed variant, by variant name."""
-    failures: dict[str, str] = {}
+@contextmanager
+def recording_failure(failures: dict[str, str], variant: str | None, directory: Path, comm: Comm) -> Iterator[None]:
+    """Context in which an error of the user that all ranks meet ends only the work on a variant. The error is added to
+    `failures` by name of the variant, and written into its directory."""
     errors = comm.Dup()  # other ranks may wait in `comm` for a message when one rank fails
-    for number, step in enumerate(planned, 1):
-        if step.variant in failures:
-            continue
-        if len(planned) > 1:
-            log.info("%s, part %d of %d: %s", step.directory, number, len(planned), ", ".join(step.stages))
-        holding: AbstractContextManager[None] = nullcontext()
-        if step.directory != directory:
-            holding = working_in(comm, step.directory, stop, take_over)
-        try:
-            with holding:
-                in_files(comm, step.directory, step.link)
-                if step.directory != directory:
-                    prepare_directory(step.scene.to_toml(), comm, step.directory)
-                run_step(step, comm, stop, overwrite)
-        except (WriteError, RunInUse, RunTakenOver):  # these concern all variants
-            raise
-        except UserError as error:
-            if step.variant is None or not all_arrive(errors) or any_rank(errors, writing_failed()):
-                raise  # also if HDF5 could not write a file: the job must then be aborted
-            failures[step.variant] = str(error)
-            log.log(OUTCOME, "variant %s failed: %s", step.variant, error)
-            text = f"{error}\n"
-            in_files(comm, step.directory, lambda: write_files({step.directory / FAILURE: text}))
+    try:
+        yield
+    except (WriteError, RunInUse, RunTakenOver):  # these concern all variants
+        raise
+    except UserError as error:
+        if variant is None or not all_arrive(errors) or any_rank(errors, writing_failed()):
+            raise  # also if HDF5 could not write a file: the job must then be aborted
+        failures[variant] = str(error)
+        log.log(OUTCOME, "variant %s failed: %s", variant, error)
+        in_files(comm, directory, lambda: write_files({directory / FAILURE: f"{failures[variant]}\n"}))
     errors.Free()
-    return failures
 
 
 def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None:

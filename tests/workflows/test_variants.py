@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -11,14 +12,13 @@ import eddies
 from eddies import stages
 from eddies.io.errors import ProductError
 from eddies.io.weights import load_weights
-from eddies.parallel.stop import StopRequest
 from eddies.scene.scene import load_scene
 from eddies.workflows import product_warnings, simulate
 from eddies.workflows.rollout.measured import TrueParticles, open_rollout
 from eddies.workflows.rollout.particle_measures import FieldsOfParticles, ParticleSpectra
 from eddies.workflows.variants import rollouts, steps
+from tests.commands import run_cli
 from tests.small_scene import TINY
-from tests.test_cli import run_cli
 
 SMALLER = ["flow.cells=16", "flow.viscosity=0.1", "spin_up.turnovers=0.3", "tracers.particles_per_side=8",
            "tracers.field_cells=12", "tracers.frame_interval=0.1", "tracers.field_every=1", "kernel.neighbors=30",
@@ -137,24 +137,17 @@ def test_what_cannot_be_run_is_refused_before_any_work(comm, folder, capfd, comm
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("broken", [False, True])
-def test_a_file_that_hdf5_could_not_write_ends_the_job(comm, folder, monkeypatch, broken):
-    """Another error of a variant does not. The last rank alone knows it."""
-    def fail(step, *_):
-        raise ProductError(f"{step.variant}: no such reactor")
-
-    scene = load_scene("small.toml")
-    planned = [step for step in steps(scene, ("simulate",), folder / "out") if step.variant]
-    monkeypatch.setattr(stages, "run_step", fail)
+@pytest.mark.parametrize("variant, broken", [("learned", False), ("learned", True), (None, False)])
+def test_an_error_ends_the_job_if_it_concerns_all_variants(comm, tmp_path, monkeypatch, variant, broken):
+    """It does if HDF5 could not write a file, which the last rank alone knows, or in what all variants share."""
     monkeypatch.setattr(stages, "writing_failed", lambda: broken and comm.rank == comm.size - 1)
-    for step in planned:
-        step.links.clear()
-    if broken:
-        with pytest.raises(ProductError, match="learned: no such reactor"):
-            stages.run_steps(planned, comm, folder / "out", StopRequest(comm), False, False)
-    else:
-        failures = stages.run_steps(planned, comm, folder / "out", StopRequest(comm), False, False)
-        assert list(failures) == [step.variant for step in planned]
+    failures = {}
+    ends = variant is None or broken
+    with pytest.raises(ProductError, match="no such reactor") if ends else nullcontext():
+        with stages.recording_failure(failures, variant, tmp_path, comm):
+            raise ProductError("no such reactor")
+    assert failures == ({} if ends else {"learned": "no such reactor"})
+    assert (tmp_path / "failure.txt").exists() != ends
 
 
 @pytest.mark.mpi(1, timeout=300)
