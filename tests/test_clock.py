@@ -18,8 +18,9 @@ def progressed(monkeypatch, caplog):
     caplog.set_level(logging.INFO, logger="eddies")
     pattern = re.compile(r"(\S+) s/step(?: \(storing: \d+ % of the time\))?  (\d+) %  (.+) left")
 
-    def run(steps, of, storing=0.0, renewed_at=None, **settings):
-        progress = ProgressLine("stage", lambda: "state", **settings)
+    def run(steps, of, storing=0.0, renewed_at=None, interval=5.0, done=0.0):
+        monkeypatch.setattr(clock, "INTERVAL", interval)
+        progress = ProgressLine("stage", lambda: "state", done)
         for step, seconds in enumerate(steps, 1):
             if step == renewed_at:
                 progress.renew()

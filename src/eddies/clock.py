@@ -16,6 +16,7 @@ YEAR = 365.25 * 86400.0      # seconds
 YEARS = 10                   # longer durations are given in years
 WARM_UP_STEPS = 2            # first steps, which plan, compile and fill caches; the median leaves them out
 RECENT = 1000                # number of latest steps whose median the progress line gives
+INTERVAL = 5.0               # wall seconds between two progress lines
 
 
 class Clock:
@@ -73,14 +74,12 @@ class ProgressLine:
     ----------
     stage : first word of the line.
     describe : returns the state of the stage as text. It must not communicate, because only ranks that log call it.
-    interval : wall seconds between two lines.
     done : fraction of the stage that an earlier job has done; the estimate of the remaining time leaves it out.
     unit : name of what is counted.
     """
 
-    def __init__(self, stage: str, describe: Callable[[], str], interval: float = 5.0, done: float = 0.0,
-                 unit: str = "step") -> None:
-        self.stage, self.describe, self.interval, self.done, self.unit = stage, describe, interval, done, unit
+    def __init__(self, stage: str, describe: Callable[[], str], done: float = 0.0, unit: str = "step") -> None:
+        self.stage, self.describe, self.done, self.unit = stage, describe, done, unit
         self._started = self._last = self._before = time.perf_counter()
         self._seconds: deque[float] = deque(maxlen=RECENT)
         self._taken, self._stored, self._aside = 0, 0.0, 0.0
@@ -110,7 +109,7 @@ class ProgressLine:
             self._seconds.clear()
         self._seconds.append(now - self._before - self._aside)
         self._before, self._aside = now, 0.0
-        interval = 0.0 if log.isEnabledFor(logging.DEBUG) else self.interval
+        interval = 0.0 if log.isEnabledFor(logging.DEBUG) else INTERVAL
         if now - self._last < interval or done <= self.done:
             return
         self._last = now

@@ -325,10 +325,8 @@ class Scene(Section):
 
     def differences(self, name: str) -> Iterator[str]:
         """Yield the lines of a variant's table: `unset`, and `key = value` for each key that differs from the scene."""
-        own, other = (dict(dotted(tomllib.loads("\n".join(write_section(scene)))))
-                      for scene in (self.without_variants, self.variant[name]))
-        for key in set(SCENE_ONLY_KEYS) & {*own, *other}:
-            own.pop(key, None), other.pop(key, None)
+        own, other = ({key: value for key, value in dotted(tomllib.loads("\n".join(write_section(scene))))
+                       if key not in SCENE_ONLY_KEYS} for scene in (self.without_variants, self.variant[name]))
         held = Layer(other).keys
         removed = dict.fromkeys(next(part for part in with_sections(key) if part not in held)
                                 for key in own if key not in held)
