@@ -212,41 +212,31 @@ def key_row(field):
     return f"| `{field.name}` | {default} | {allowed(rule)} | {rule.about} |".replace("|k|", r"\|k\|")
 
 
-def term_rows():
-    """The rows of the keys of each term, by its word."""
-    lines = []
-    for word in TERMS:
-        settings = settings_class(word)
-        lines.append(f"| **`[model.{word}]`** | | | *{settings.__doc__.splitlines()[0]}* |")
-        lines += [key_row(key) for key in dataclasses.fields(settings)]
-    return lines
+def section_rows(name, kind, need=""):
+    """The rows of a section and of its inner sections."""
+    yield f"| **`[{name}]`**{need} | | | *{kind.__doc__.splitlines()[0]}* |"
+    yield from (key_row(key) for key in dataclasses.fields(kind) if "rule" in key.metadata)
+    yield from inner_rows(kind, f"{name}.")
+    if kind is Model:
+        for word in TERMS:
+            yield from section_rows(f"model.{word}", settings_class(word))
+    if kind is Tracers:
+        yield f"| **`[tracers.NAME]`**, optional | | | *A set of tracers; keys: {', '.join(SET_KEYS)}.* |"
 
 
-def scene_reference():
-    """The scene reference, from the declarations of the keys."""
-    lines = ["| key | default | values | meaning |", "|---|---|---|---|"]
-    fields = dataclasses.fields(Scene)
-    lines += [key_row(field) for field in fields if "rule" in field.metadata]
-    for field in fields:
+def inner_rows(kind, prefix):
+    """The rows of the sections in a section, or in the whole scene."""
+    for field in dataclasses.fields(kind):
         if field.metadata.get("section"):
-            kind, default = field.metadata["section"], field.default
-            need = ", required" if default is dataclasses.MISSING else ", optional" if default is None else ""
-            lines.append(f"| **`[{field.name}]`**{need} | | | *{kind.__doc__.splitlines()[0]}* |")
-            lines += [key_row(key) for key in dataclasses.fields(kind) if "rule" in key.metadata]
-            for inner in [key for key in dataclasses.fields(kind) if key.metadata.get("section")]:
-                of_it = inner.metadata["section"]
-                lines.append(f"| **`[{field.name}.{inner.name}]`**, optional | | | *{of_it.__doc__.splitlines()[0]}* |")
-                lines += [key_row(key) for key in dataclasses.fields(of_it)]
-            if kind is Model:
-                lines += term_rows()
-            if kind is Tracers:
-                lines.append("| **`[tracers.NAME]`**, optional | | | *A set of tracers; keys: "
-                             f"{', '.join(SET_KEYS)}.* |")
-    return "\n".join(lines)
+            need = {dataclasses.MISSING: ", required", None: ", optional"}.get(field.default, "")
+            yield from section_rows(f"{prefix}{field.name}", field.metadata["section"], need)
 
 
 def test_scene_reference():
-    assert marked("scene reference") == scene_reference()
+    """The reference has the declarations of the keys."""
+    keys = [key_row(field) for field in dataclasses.fields(Scene) if "rule" in field.metadata]
+    rows = ["| key | default | values | meaning |", "|---|---|---|---|", *keys, *inner_rows(Scene, "")]
+    assert marked("scene reference").splitlines() == rows
 
 
 @pytest.mark.parametrize("words, default, heading", [
