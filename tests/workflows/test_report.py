@@ -500,13 +500,13 @@ def test_a_report_can_be_stopped_between_two_rounds_of_pages(comm, tmp_path, mon
     read = []
     monkeypatch.setattr(report, "read_page", read_page)
     others = dict.fromkeys("abcd", tmp_path)
-    stored = report.Run(tmp_path, None, dict.fromkeys("abcd", ()), {"": tmp_path, **others})
+    pages = report.Report(tmp_path, "", dict.fromkeys("abcd", ()), {"": tmp_path, **others})
     checks = 5  # after the measures of each page
     with pytest.raises(Stopped):
-        report._make(stored, comm, comm.Split(comm.rank), StopAtStep(comm, checks))
+        report._make(pages, comm, comm.Split(comm.rank), StopAtStep(comm, checks))
     assert read == ([True] if comm.rank == 0 else [False] * 3)
     read.clear()
-    made, _ = report._make(stored, comm, comm.Split(comm.rank), StopAtStep(comm, checks + 4 - comm.size))
+    made, _ = report._make(pages, comm, comm.Split(comm.rank), StopAtStep(comm, checks + 4 - comm.size))
     assert len(read) == len(made) and comm.allreduce(len(made)) == 5
 
 

@@ -121,16 +121,16 @@ def metrics_json(warnings: Sequence[str], sections: Sequence[Section]) -> str:
 
 
 def write_page(output: Path, run: RunRecord, sections: Sequence[Section], images: Mapping[str, bytes],
-               beside: Mapping[Path, str]) -> None:
-    """Write index.html, metrics.json, figures/NAME.png and the texts `beside`, by path. Remove older figures.
+               beside: Mapping[str, str]) -> None:
+    """Write index.html, metrics.json, figures/NAME.png and the texts `beside`, by file name. Remove older figures.
 
     Raises OSError or WriteError. If a file cannot be written, no existing file is changed.
     """
     earlier = (output / "metrics.json").exists()  # only then are other figures removed
     (output / "figures").mkdir(parents=True, exist_ok=True)
     figures = {output / "figures" / f"{name}.png": image for name, image in images.items()}
-    write_files({**figures, output / "index.html": render_page(run, sections, images),
-                 output / "metrics.json": metrics_json(run.warnings, sections), **beside})
+    texts = {"index.html": render_page(run, sections, images), "metrics.json": metrics_json(run.warnings, sections)}
+    write_files({**figures, **{output / name: text for name, text in (texts | dict(beside)).items()}})
     for path in (output / "figures").glob("*.png"):
         if earlier and path not in figures:
             path.unlink()

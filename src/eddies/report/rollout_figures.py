@@ -101,7 +101,7 @@ def errors_over_time(model: Mapping[str, np.ndarray], truth: Mapping[str, np.nda
     divergence.set(title="PDF divergence", ylabel="KL divergence (nats)", ylim=(0, None))
     divergence.legend()
     for axis in figure.axes:
-        axis.set(xlabel="time $t/T$", xlim=(0, model["time"][-1] / turnover))
+        axis.set(xlabel="time $t/T$", xlim=(0, model["time"][-1] / turnover or None))  # a single frame is at time 0
     letter(figure.axes)
     return figure
 

@@ -46,12 +46,11 @@ class ErrorAgainstTime:
     """The errors and run times of all variants.
 
     rows: the numbers of each variant by key; a missing number is None. subject: name of the variant with which the
-    others are compared. simulation_seconds: wall seconds of the direct simulation per turnover; None if unknown.
+    others are compared.
     """
 
     rows: Sequence[Row]
     subject: str
-    simulation_seconds: float | None = None
 
     @property
     def drawn(self) -> list[str]:

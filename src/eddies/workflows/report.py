@@ -99,35 +99,19 @@ class Page:
 
 
 @dataclass(frozen=True)
-class Run:
-    """A run directory: its scene (None if there is no readable one), the directories of its variants' rollouts, and its
-    pages.
+class Report:
+    """The pages of the report on a run directory.
 
-    pages: run directory of each variant that was run, by name; the main page comes first. If no variant has a rollout,
-    there is one page, of the run directory itself, under the name "". output: directory of the reports; None: "report"
-    in each directory.
+    scene_name: name of the scene. runs: directories of the rollouts of each variant, by name. pages: run directory of
+    each variant that was run, by name; the main page comes first. If no variant has a rollout, there is one page, of
+    the run directory itself, under the name "". output: directory of the reports; None: "report" in each directory.
     """
 
     directory: Path
-    scene: Scene | None
+    scene_name: str
     runs: Mapping[str, Sequence[Path]]
     pages: Mapping[str, Path]
     output: Path | None = None
-
-    @classmethod
-    def of(cls, directory: Path, first: Sequence[str] = (), output: Path | None = None) -> Run:
-        """Read a run directory. The main page shows the first variant in the list `first` that was run. If none of them
-        was run, it shows the first variant of the scene that was run."""
-        scene, runs = None, {}
-        with contextlib.suppress(SceneError):
-            scene = load_scene(directory / "scene.toml")
-        if scene is not None:
-            scene.check_variants(first)
-            if scene.simulation is not None:
-                runs = {name: [*scenes] for name, scenes in rollouts(scene, directory).items()}
-        ran = {name: first for name, (first, *_) in runs.items() if _has_rollout(first)}
-        main = next((name for name in (*first, *ran) if name in ran), "")
-        return cls(directory, scene, runs, {main: ran.get(main, directory), **ran}, output)
 
     @property
     def main(self) -> str:
@@ -144,7 +128,7 @@ class Run:
 
     def links(self, page: Path) -> list[tuple[str, str]]:
         """Titles and relative paths of the other pages. `page` is the directory of the page that links to them."""
-        found = [] if page == self.directory else [(f"all of {self.scene.name}", self.directory)]
+        found = [] if page == self.directory else [(f"all of {self.scene_name}", self.directory)]
         found += [(name, where) for name, where in self.pages.items() if where not in (page, self.directory)
                   and not (page == self.directory and name == self.main)]
         return [(title, os.path.relpath(self.report_of(where) / "index.html", self.report_of(page)))
@@ -153,6 +137,24 @@ class Run:
 
 def _has_rollout(directory: Path) -> bool:
     return (directory / ROLLOUT).exists()
+
+
+def _plan(directory: Path, chosen: Sequence[str] = (), output: Path | None = None) -> tuple[Scene | None, Report]:
+    """Return the scene of a run directory, None if there is no readable one, and the pages to make.
+
+    The main page shows the first variant in the list `chosen` that was run. If none of them was run, it shows the first
+    variant of the scene that was run.
+    """
+    scene, runs = None, {}
+    with contextlib.suppress(SceneError):
+        scene = load_scene(directory / "scene.toml")
+    if scene is not None:
+        scene.check_variants(chosen)
+        if scene.simulation is not None:
+            runs = {name: [*scenes] for name, scenes in rollouts(scene, directory).items()}
+    ran = {name: first for name, (first, *_) in runs.items() if _has_rollout(first)}
+    main = next((name for name in (*chosen, *ran) if name in ran), "")
+    return scene, Report(directory, scene.name if scene else "", runs, {main: ran.get(main, directory), **ran}, output)
 
 
 def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: StopRequest | None = None,
@@ -170,72 +172,70 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: S
     directory, stop = Path(directory), stop or StopRequest(comm)
     for problem in directory_problems(("report",), comm, directory) if output is None else ():
         raise SceneError(problem)
-    stored = in_files(comm, directory, lambda: Run.of(directory, variants, output))
+    scene, report = in_files(comm, directory, lambda: _plan(directory, variants, output))
     alone = comm.Split(comm.rank)
     try:
-        made, rows = _make(stored, comm, alone, stop)
+        made, found = _make(report, comm, alone, stop)
         own = [page for page in made.values() if page.directory != directory]
         on_all_ranks(comm, lambda: in_files(alone, directory, lambda: [
-            _write(page, page.directory, stored.report_of(page.directory), stored.links(page.directory))
-            for page in own]), ProductError)
+            _write(report, page, page.directory) for page in own]), ProductError)
+        for name, where in report.pages.items():
+            if where != directory:
+                log.info("report: variant %s: %s", name, report.report_of(where) / "index.html")
+        in_files(comm, report.report_of(directory),
+                 lambda: _write_main(scene, report, made[report.main], found, comm.size, alone))
     finally:
         alone.Free()
-    for name, where in stored.pages.items():
-        if where != directory:
-            log.info("report: variant %s: %s", name, stored.report_of(where) / "index.html")
-    in_files(comm, stored.report_of(directory), lambda: _write_main(stored, made[stored.main], rows, comm))
 
 
 def sections_of(directory: Path, alone: Comm) -> list[Section]:
     """Return all sections of the main page of a run directory, made by one rank, with figures that are not drawn."""
-    stored = Run.of(directory)
-    stored = replace(stored, pages={stored.main: stored.pages[stored.main]})
-    made, rows = _make(stored, alone, alone, StopRequest(alone), draw=False)
-    page = made[stored.main]
-    return [*_table_section(stored, page, rows)[0], *page.sections]
+    scene, report = _plan(directory)
+    report = replace(report, pages={report.main: report.pages[report.main]})
+    made, found = _make(report, alone, alone, StopRequest(alone), draw=False)
+    page = made[report.main]
+    return [*_compare(scene, report, page, found, 1, alone)[0], *page.sections]
 
 
-def _make(stored: Run, comm: Comm, alone: Comm, stop: StopRequest,
-          draw: bool = True) -> tuple[dict[str, Page], dict[str, Row]]:
-    """Make the pages and the rows of all variants. Return the pages of this rank, and all rows, by name of the variant.
+def _make(report: Report, comm: Comm, alone: Comm, stop: StopRequest,
+          draw: bool = True) -> tuple[dict[str, Page], dict[str, list[Row]]]:
+    """Make the pages. Return the pages of this rank, and the `numbers` of all rollouts, by name of the variant.
 
-    All ranks measure each rollout together. The rank that makes the variant's page and row collects the results. The
-    pages are made in rounds. Raises Stopped, after a variant's rollouts are measured or after a round, when `stop` asks
-    for it.
+    All ranks measure each rollout together. The rank that makes the variant's page collects the results. The pages are
+    made in rounds. A variant without one of its rollouts has no numbers. Raises Stopped, after a variant's rollouts are
+    measured or after a round, when `stop` asks for it.
     """
-    names = list(stored.pages) + [name for name in stored.runs if name not in stored.pages]
-    (makers, rounds), made, rows, truths, scanned = _makers(names, comm.size), {}, {}, {}, {}
+    names = list(report.pages) + [name for name in report.runs if name not in report.pages]
+    (makers, rounds), made, found, truths, scanned = _makers(names, comm.size), {}, {}, {}, {}
     with ExitStack() as files:
         measured: dict[str, list[MeasuredRollout]] = {name: [] for name in names}
         for name in names:
-            for where in stored.measured(name):
+            for where in report.measured(name):
                 from eddies.workflows.rollout.measured import open_rollout  # needs torch
                 opened = on_all_ranks(comm, lambda where=where: files.enter_context(open_rollout(where, alone)),
                                       ProductError)
-                shown = where == stored.pages.get(name)
-                opened.measure(comm, makers[name], shown, shown and name == stored.main, truths)
+                shown = where == report.pages.get(name)
+                opened.measure(comm, makers[name], shown, shown and name == report.main, truths)
                 measured[name].append(opened)
             stop.check()
 
         def make(name: str) -> None:
-            if name in stored.pages:
-                page = made[name] = read_page(stored.pages[name], alone, next(iter(measured[name]), None), scanned,
-                                              main=name == stored.main)
+            if name in report.pages:
+                page = made[name] = read_page(report.pages[name], alone, next(iter(measured[name]), None), scanned,
+                                              main=name == report.main)
                 if draw:
                     page.draw(page.sections)
-            if stored.main:
-                runs = stored.runs[name]
-                realised = [numbers(each) for each in measured[name]] if len(measured[name]) == len(runs) else []
-                rows[name] = row(stored.scene, name, runs, realised, alone)
+            if report.main and len(measured[name]) == len(report.runs[name]):
+                found[name] = [numbers(each) for each in measured[name]]
             for each in measured[name]:
                 each.forget()
 
         for turn in range(max(rounds.values()) + 1):
             own = [name for name in names if (makers[name], rounds[name]) == (comm.rank, turn)]
-            on_all_ranks(comm, lambda: [in_files(alone, stored.directory, lambda: make(name)) for name in own],
+            on_all_ranks(comm, lambda: [in_files(alone, report.directory, lambda: make(name)) for name in own],
                          ProductError)
             stop.check()
-    return made, {name: found for part in comm.allgather(rows) for name, found in part.items()}
+    return made, {name: each for part in comm.allgather(found) for name, each in part.items()}
 
 
 def _makers(names: Sequence[str], ranks: int) -> tuple[dict[str, int], dict[str, int]]:
@@ -417,43 +417,44 @@ def _cost_section(page: Page) -> Section:
                    main=("seconds_per_step",))
 
 
-def _table_section(stored: Run, page: Page, rows: Mapping[str, Row]
-                   ) -> tuple[list[Section], table_of_variants.ErrorAgainstTime | None]:
-    """Return the section on all variants, in a list, and its table; an empty list and None if no variant was run."""
-    if not stored.main:
-        return [], None
-    scene, of_variants = stored.scene, [rows[name] for name in stored.runs]
+def _compare(scene: Scene | None, report: Report, page: Page, found: Mapping[str, Sequence[Row]], ranks: int,
+             alone: Comm) -> tuple[list[Section], dict[str, str]]:
+    """Return the section on all variants, in a list, and the texts of variants.csv and variants.json by file name.
+
+    Both are empty if no variant was run. page: the main page. found: `numbers` of each variant's rollouts. ranks: the
+    number of ranks of the job.
+    """
+    if not report.main:
+        return [], {}
     variants, another = scene.variant or {scene.name: scene}, with_another_kernel(scene)
-    leave_out_kernel(of_variants, another)
+    rows = [row(scene, name, runs, found.get(name, ()), alone) for name, runs in report.runs.items()]
+    leave_out_kernel(rows, another)
     repeating = [name for name, each in variants.items() if each.coarse_cells == each.flow.cells]
-    simulation = simulation_seconds(of_variants, repeating, page.simulation_seconds)
-    add_break_even(of_variants, simulation)
-    table = table_of_variants.ErrorAgainstTime(of_variants, stored.main, simulation)
+    simulation = simulation_seconds(rows, repeating, page.simulation_seconds)
+    add_break_even(rows, simulation)
+    table = table_of_variants.ErrorAgainstTime(rows, report.main)
     remarks = notes(scene.realisations or (), another, {name: each.tracers for name, each in variants.items()},
                     {name: each.coarse_cells for name, each in variants.items()})
-    return [table_of_variants.section(table, remarks)], table
+    lines = io.StringIO(newline="")
+    writer = csv.DictWriter(lines, COLUMNS)
+    writer.writeheader()
+    writer.writerows(rows)
+    reference = product_attributes(page.directory / "ground_truth.h5", "reference")
+    flow = {key: finite(float(value)) for key, value in reference.items() if isinstance(value, (float, np.number))}
+    record = {"name": scene.name, "title": scene.title, "machine": machine(scene.device, ranks), "flow": flow,
+              "simulation_seconds": simulation, "rows": rows, "summary": table.summary}
+    return [table_of_variants.section(table, remarks)], {
+        "variants.csv": lines.getvalue(), "variants.json": json.dumps(record, indent=2, allow_nan=False) + "\n"}
 
 
-def _write_main(stored: Run, page: Page, rows: Mapping[str, Row], comm: Comm) -> None:
+def _write_main(scene: Scene | None, report: Report, page: Page, found: Mapping[str, Sequence[Row]], ranks: int,
+                alone: Comm) -> None:
     """Write the main page, with the table of variants if there is one, and log its numbers; one rank calls it."""
-    output, scene, beside = stored.report_of(stored.directory), stored.scene, {}
-    first, table = _table_section(stored, page, rows)
+    first, beside = _compare(scene, report, page, found, ranks, alone)
     page.draw(first)
     page.sections = [*first, *page.sections]
-    if table is not None:
-        lines = io.StringIO(newline="")
-        writer = csv.DictWriter(lines, COLUMNS)
-        writer.writeheader()
-        writer.writerows(table.rows)
-        reference = product_attributes(page.directory / "ground_truth.h5", "reference")
-        flow = {key: finite(float(value)) for key, value in reference.items() if isinstance(value, (float, np.number))}
-        record = {"name": scene.name, "title": scene.title, "machine": machine(scene.device, comm.size), "flow": flow,
-                  "simulation_seconds": table.simulation_seconds, "rows": table.rows, "summary": table.summary}
-        beside = {output / "variants.csv": lines.getvalue(),
-                  output / "variants.json": json.dumps(record, indent=2, allow_nan=False) + "\n"}
-    page.seconds = {**read_stage_seconds(stored.directory), **page.seconds}
-    text = scene.to_toml() if scene is not None and scene.variant else None
-    _write(page, stored.directory, output, stored.links(stored.directory), beside, text)
+    page.seconds = {**read_stage_seconds(report.directory), **page.seconds}
+    _write(report, page, report.directory, beside, scene.to_toml() if scene is not None and scene.variant else "")
     for section in page.sections:
         count = len(section.illustrations)
         log.info("report: %s%s", section.title, f" ({count} figure{'s' if count > 1 else ''})" if count else "")
@@ -466,9 +467,9 @@ def _write_main(stored: Run, page: Page, rows: Mapping[str, Row], comm: Comm) ->
         log.warning("report: %s", warning)
 
 
-def _write(page: Page, directory: Path, output: Path, links: Sequence[tuple[str, str]],
-           beside: Mapping[Path, str] | None = None, scene: str | None = None) -> None:
-    """Write a page and its numbers into `output`, and the files `beside` (content by path). `scene` is the text of the
+def _write(report: Report, page: Page, directory: Path, beside: Mapping[str, str] | None = None,
+           scene: str = "") -> None:
+    """Write a page about a run directory, its numbers, and the texts `beside` by file name. `scene` is the text of the
     scene for a page about all variants; without it, the page shows the scene of the last product."""
     rows = [("stage", "ranks", "wall time (s)", "date", "eddies", "commit", "libraries")]
     for kind, origin in page.provenance.items():
@@ -479,5 +480,5 @@ def _write(page: Page, directory: Path, output: Path, links: Sequence[tuple[str,
                      ", ".join(f"{name} {version}" for name, version in origin["libraries"].items())))
     text = scene or list(page.provenance.values())[-1]["scene"]
     title = tomllib.loads(text).get("title", "untitled scene")
-    write_page(output, RunRecord(directory.resolve().name, title, text, rows, page.warnings, links), page.sections,
-               page.images, beside or {})
+    record = RunRecord(directory.resolve().name, title, text, rows, page.warnings, report.links(directory))
+    write_page(report.report_of(directory), record, page.sections, page.images, beside or {})
