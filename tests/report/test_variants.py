@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from eddies.measures import DRAWN, MEASURES, SHOWN
 from eddies.report.figures import png
-from eddies.report.variants import ErrorAgainstTime, name_points, scatter, section
+from eddies.report.variants import MOST_NAMED, ErrorAgainstTime, name_points, scatter, section
 from eddies.workflows.variant_rows import BEFORE, BREAK_EVEN
 
 
@@ -59,6 +59,14 @@ def test_what_became_unstable_is_named_with_its_time():
     crosses = [line for line in axis.lines if line.get_marker() == "x"]
     assert len(crosses) == 1 and crosses[0].get_xdata() == 50.0
     assert crosses[0].get_ydata() > max(r["velocity_kl"] or 0 for r in ROWS)
+
+
+def test_a_crowded_panel_has_no_names_of_coarse_grids_off_the_front():
+    grids = [row(f"grid-{number}", 30.0 + number, 0.5, kind="coarse grid") for number in range(MOST_NAMED - 2)]
+    named = [ROWS[0], ROWS[2], row("grid on the front", 2.0, 0.4, kind="coarse grid")]
+    for rows, expected in (([*named, *grids[1:]], [*named, *grids[1:]]), ([*named, *grids], named)):
+        axis = scatter(ErrorAgainstTime(rows, "learned"), ["velocity_error_early"]).axes[0]
+        assert texts(axis) == {each["name"] for each in expected}
 
 
 @pytest.mark.parametrize("kinds", [1, 6])
