@@ -96,6 +96,7 @@ BAD_OVERRIDES = [
     ('title=""', 'title = "": must be a string in quotes'),
     ('name="a\\u0000b"', 'must be the name of a directory'),
     ("name=-n", 'name = "-n": must be the name of a directory'),
+    ("device=3", 'device = 3: must be one of "cpu", "cuda"'),
     ("device=tpu", 'device = "tpu": must be one of "cpu", "cuda"'),
     ("training.truths=runs/a", '[training] truths = "runs/a": must be a list of strings'),
     ("training.horizons.steps=0", "[training.horizons] steps = 0: must be a whole number at least 1"),

@@ -72,7 +72,7 @@ def run(arguments: list[str] | None) -> int:
     # This precedes the imports of numpy and torch, which would start a thread for each core in each rank.
     default_to_one_thread()
     signals = catch_signals()  # early, because numpy and MPI take a second to start
-    from eddies.kernels.library import keep_freed_memory
+    from eddies.kernels.library import keep_freed_memory, library
     keep_freed_memory()
     try:
         os.getcwd()
@@ -95,7 +95,6 @@ def run(arguments: list[str] | None) -> int:
             complain(f"error: {error}")
         return BAD_INPUT
     comm, exit_comm = MPI.COMM_WORLD, MPI.COMM_WORLD.Dup()
-    from eddies.kernels.library import library
     from eddies.parallel.broadcast import require_same
     from eddies.parallel.stop import Stopped
     options = None

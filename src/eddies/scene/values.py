@@ -188,8 +188,9 @@ def read_section(kind: type[Section], table: Any, name: str = "", others: Sequen
         else:
             raise _unknown_key(key, value, name, [*fields, *others])
     for key, field in fields.items():
-        if key not in values and field.default is field.default_factory is MISSING:
-            raise _missing_key(kind, field, name)
+        rule = rule_of(kind, field)
+        if rule is not None and key not in values and field.default is field.default_factory is MISSING:
+            raise KeyProblem(name, key, f": this key is missing{_meaning(rule)}; give it {rule.allowed}")
     try:
         return kind(**values)
     except KeyProblem as problem:
@@ -201,13 +202,6 @@ def _unknown_key(key: str, value: Any, section: str, valid: Sequence[str]) -> Sc
     problem = (f": no such {'section' if is_section else 'key'}; {nearest(key, valid, cutoff=0.5)}valid here: "
                f"{', '.join(valid) or 'no key; remove it'}")
     return SceneError(f"[{key}]{problem}", key) if is_section else KeyProblem(section, key, problem)
-
-
-def _missing_key(kind: type[Section], field: dataclasses.Field, section: str) -> SceneError:
-    rule = rule_of(kind, field)
-    if rule is None:
-        return SceneError(f"[{field.name}]: this section is missing; every scene needs it", field.name)
-    return KeyProblem(section, field.name, f": this key is missing{_meaning(rule)}; give it {rule.allowed}")
 
 
 def write_section(section: Section, name: str = "", all_keys: bool = False) -> list[str]:
