@@ -17,7 +17,7 @@ from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.exchanges import mean_over_ranks, relative_error, root_mean_square, sum_over_ranks
 from eddies.particles.model import LagrangianModel
 from eddies.particles.neighbor_list import NeighborList
-from eddies.particles.neighborhood import Neighborhood
+from eddies.particles.neighborhood import LocalParticles, Neighborhood
 from eddies.particles.particle_field import grid_points
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reconstruction import reconstruct, volumes
@@ -134,7 +134,7 @@ class TrainingFrame:
             if around is None or around.cutoff < kernel.support * (1 - 1e-9) or self.later is not None:
                 around = Neighborhood(self.decomposition, kernel.support, 0.0)
                 around.update(averaged)
-            position = around.local(averaged.position).position
+            position = LocalParticles(averaged.position, around).position
             pairs = around.neighbors.pairs(position[: len(self.particles)], position, dtype=self.acceleration.dtype)
             self._within = KernelNeighborhood(kernel, around, position, around.column(volumes(kernel, pairs)))
         return self._within

@@ -142,7 +142,7 @@ class ParticleDynamics:
         if self.neighborhood is not None:
             self.neighborhood.update(particles)
             if self._local is None or not self._local.fit(particles.position):
-                self._local = self.neighborhood.local(particles.position)
+                self._local = LocalParticles(particles.position, self.neighborhood)
         if density is None and not self.model.density_is_given:
             density = particles.density
         return Context(self.decomposition, particles, self.model.flow, self._local, self.resolution, rows, self.dtype,

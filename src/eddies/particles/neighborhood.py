@@ -128,9 +128,6 @@ class Neighborhood:
             self._unlisted = None
         return self._neighbors
 
-    def local(self, position: Tensor) -> LocalParticles:
-        return LocalParticles(position, self)
-
     def column(self, owned: Tensor) -> Tensor:
         """Column (n, ...) of the owned particles, followed by its ghost rows."""
         return with_ghosts(self.halo, owned)
