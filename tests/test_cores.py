@@ -1,16 +1,12 @@
 """Cores and threads of a process: program and launcher read OMP_NUM_THREADS alike."""
 
 import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
 from eddies import cores
 from mpi_tools import launch
-
-CHECKOUT = Path(__file__).parents[1]
+from tests.commands import LAUNCHER, python
 
 
 @pytest.mark.parametrize("given, threads", [
@@ -57,6 +53,5 @@ def test_container_quota_limits_the_cores(monkeypatch, tmp_path):
 
 def test_the_launcher_needs_no_package():
     """It starts what sets up the packages."""
-    ended = subprocess.run([sys.executable, "-S", "-E", CHECKOUT / "mpi_tools/launch.py", "-n", "0", "--", "true"],
-                           capture_output=True, text=True, timeout=20)
+    ended = python("-S", "-E", LAUNCHER, "-n", "0", "--", "true")
     assert ended.returncode == 2 and '-n = "0": must be a whole number of at least 1' in ended.stderr

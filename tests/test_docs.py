@@ -5,8 +5,6 @@ import dataclasses
 import json
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -24,6 +22,7 @@ from eddies.scene.sections import METHODS, SET_KEYS, Simulation
 from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS
 from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.foreseen.ranks import most_ranks
+from tests.commands import python
 
 CHECKOUT = Path(__file__).parents[1]
 PAGES = [CHECKOUT / "README.md", *(page for pages in ("*.md", "notes/*.md", "notebooks/*.ipynb")
@@ -342,6 +341,5 @@ def test_python_runs_on_the_files_of_a_run(comm, tmp_path, monkeypatch, capsys, 
 
 def test_the_site_builds_without_a_warning(tmp_path):
     """All but the writing of HTML."""
-    command = [sys.executable, "-m", "sphinx", "-q", "-W", "-b", "dummy", CHECKOUT / "docs", tmp_path / "site"]
-    built = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=200)
+    built = python("-m", "sphinx", "-q", "-W", "-b", "dummy", CHECKOUT / "docs", tmp_path / "site", timeout=200)
     assert built.returncode == 0 and not built.stderr, built.stderr

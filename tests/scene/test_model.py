@@ -109,6 +109,9 @@ def test_bad_model(changes, message):
     (lambda: PairNetwork(hidden=(0,)), "[PairNetwork] hidden = [0]: must be a list such as [16, 16]"),
     (lambda: Scene(flow=3, time=Time(duration=1)), "flow = 3: must be a Flow"),
     (lambda: replace(load_scene(TINY).flow, viscosity="thin"), '[flow] viscosity = "thin": must be a number'),
+    (lambda: Scene(flow=Flow(fluid="compressible", cells=16, viscosity=1), time=Time(duration=1)), "a compressible"),
+    (lambda: replace(load_scene(TINY, ["training.field_weight=0.1", "training.combined_steps=2"]), kernel=None),
+     "[training] field_weight = 0.1: this loss"),
 ])
 def test_objects_of_a_program_are_checked_as_files_are(make, message):
     refused(message, make)

@@ -8,7 +8,7 @@ import pytest
 
 from eddies.pipeline import STAGES as TABLE
 from eddies.scene.layers import read_document
-from eddies.scene.scene import Eulerian, Flow, Horizons, Scene, SceneError, Time, builtin_scenes, load_scene
+from eddies.scene.scene import Eulerian, Flow, Horizons, Scene, SceneError, builtin_scenes, load_scene
 from eddies.scene.schema import json_schema
 from eddies.scene.sections import CLOSURES
 from eddies.scene.values import rule_of
@@ -186,13 +186,6 @@ def test_steps_of_a_dense_scheme_need_not_fall_on_frames():
     scene = load_scene(TINY, ["simulation.integrator=rk3", "simulation.step=0.07"])
     assert (scene.simulation.step, scene.simulation.frame_interval) == (0.07, 0.1)
     assert load_scene(TINY, ["simulation.integrator=verlet", "simulation.step=0.05"]).simulation.step == 0.05
-
-
-def test_scenes_of_a_program_are_checked_too():
-    with pytest.raises(SceneError, match="a compressible fluid needs"):
-        Scene(flow=Flow(fluid="compressible", cells=16, viscosity=0.1), time=Time(duration=1.0))
-    with pytest.raises(SceneError, match=r"\[training\] field_weight = 0.1: this loss"):
-        replace(load_scene(TINY, ["training.field_weight=0.1", "training.combined_steps=2"]), kernel=None)
 
 
 def test_every_key_is_explained_and_listed():
