@@ -15,6 +15,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from eddies.kernels import pairs as compiled
 from eddies.kernels.library import in_use, load
 from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand
 
@@ -45,14 +46,14 @@ MODELS = {
 }
 
 
-def actions(library: ctypes.CDLL, side: int) -> dict[str, Callable[[], list[np.ndarray]]]:
+def actions(side: int) -> dict[str, Callable[[], list[np.ndarray]]]:
     """The actions to time, by name."""
     random, count = np.random.default_rng(1), side**3
     radius = (NEIGHBORS / count * 3 / (4 * math.pi)) ** (1 / 3)
     columns = random.uniform(size=(count, 3)), random.normal(size=(count, 3)), random.normal(size=(1, count))
     found: dict[str, Callable[[], list[np.ndarray]]] = {}
     for name, (given, mutual) in MODELS.items():
-        pairs = CompiledPairs(library, PairSpace(1.0, True, radius, radius, 1.0, mutual), *columns,
+        pairs = CompiledPairs(PairSpace(1.0, True, radius, radius, 1.0, mutual), *columns,
                               np.ones(count, bool), np.float32)
         summands, parameters = zip(*given)
         by = [random.normal(size=(len(one.parity), count)).astype(np.float32) for one in summands]
@@ -67,20 +68,19 @@ def main() -> None:
     parser.add_argument("libraries", nargs="*")
     options = parser.parse_args()
     libraries = {path: ctypes.CDLL(path) for path in options.libraries} or {in_use(): load(in_use())}
-    timed = {name: actions(library, options.side) for name, library in libraries.items()}
-    first = next(iter(timed.values()))
-    for action in first:
-        least, found = dict.fromkeys(timed, math.inf), {}
+    for name, action in actions(options.side).items():
+        least, found = dict.fromkeys(libraries, math.inf), {}
         for _ in range(REPEATS):
-            for name, these in timed.items():
+            for path, library in libraries.items():
+                compiled.library = lambda library=library: library
                 start = time.process_time()
-                found[name] = these[action]()
-                least[name] = min(least[name], time.process_time() - start)
-        expected = found[next(iter(timed))]
-        for name, seconds in least.items():
-            apart = max(np.abs(one - other).max() / np.abs(other).max() for one, other in zip(found[name], expected))
-            print(f"{action:18} {seconds:.4f} s  64^3 on two cores {seconds * (64 / options.side)**3 / 2:.2f} s  "
-                  f"differs by {apart:.0e}  {name}", flush=True)
+                found[path] = action()
+                least[path] = min(least[path], time.process_time() - start)
+        expected = found[next(iter(libraries))]
+        for path, seconds in least.items():
+            apart = max(np.abs(one - other).max() / np.abs(other).max() for one, other in zip(found[path], expected))
+            print(f"{name:18} {seconds:.4f} s  64^3 on two cores {seconds * (64 / options.side)**3 / 2:.2f} s  "
+                  f"differs by {apart:.0e}  {path}", flush=True)
 
 
 if __name__ == "__main__":

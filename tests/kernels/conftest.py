@@ -1,14 +1,17 @@
 import pytest
 
-from eddies.kernels.library import INSTRUCTION_SETS, instruction_sets, load
+from eddies.kernels import library as module
 
 
-@pytest.fixture(params=INSTRUCTION_SETS)
-def library(request):
-    """The library for each instruction set that this processor runs."""
-    if request.param not in instruction_sets():
+@pytest.fixture(params=module.INSTRUCTION_SETS)
+def library(request, monkeypatch):
+    """The library that all kernels use, for each instruction set that this processor runs."""
+    if request.param not in module.instruction_sets():
         pytest.skip("this processor does not run it")
-    return load(request.param)
+    monkeypatch.setattr(module, "in_use", lambda: request.param)
+    module.library.cache_clear()
+    yield module.library()
+    module.library.cache_clear()
 
 
 @pytest.fixture

@@ -13,9 +13,9 @@ TOLERANCE = {"float64": 1e-13, "float32": 3e-6}
 SHAPES = [(3, 5, 14), (0, 4, 8)]
 
 
-def set_up(library, precision, cells=10, rank=0, ranks=1):
+def set_up(precision, cells=10, rank=0, ranks=1):
     grid = SpectralGrid(SlabDecomposition(SimpleNamespace(rank=rank, size=ranks), 5.0, cells), precision)
-    return grid, Formulas(library, grid.wavevector)
+    return grid, Formulas(grid.wavevector)
 
 
 def fields(count, shape, precision="float64", apart=0):
@@ -45,7 +45,7 @@ def at_all_kz(factors):
 @pytest.mark.parametrize("shape", SHAPES)
 def test_products_at_grid_points(library, close, shape, precision):
     """-u.grad u + 2 nu (S - 1/3 div u).grad s, -u.grad s, and u x omega."""
-    _, compiled = set_up(library, precision)
+    _, compiled = set_up(precision)
     for viscosity, apart in ((0.0, 16), (0.3, 0), (0.3, 16)):
         given, found = fields(15, shape, precision, apart), fields(4, shape, precision, apart)
         compiled.advection(given, viscosity, found)
@@ -63,7 +63,7 @@ def test_products_at_grid_points(library, close, shape, precision):
 @pytest.mark.parametrize("precision", TOLERANCE)
 @pytest.mark.parametrize("rank, ranks", [(0, 1), (1, 9), (8, 9)])  # the last rank has no modes
 def test_operators_on_modes(library, close, rank, ranks, precision):
-    grid, compiled = set_up(library, precision, rank=rank, ranks=ranks)
+    grid, compiled = set_up(precision, rank=rank, ranks=ranks)
     close(compiled.project(modes(grid, 3)), grid.solenoidal(modes(grid, 3)), TOLERANCE[precision])
     for count in (1, 4):
         decays = [(factors(grid, 1, seed), modes(grid, 3, seed)) for seed in range(count)]
@@ -81,7 +81,7 @@ def test_operators_on_modes(library, close, rank, ranks, precision):
 
 
 def test_nan_stays_nan(library):
-    grid, compiled = set_up(library, "float64")
+    grid, compiled = set_up("float64")
     out = fields(4, (2, 3, 4))
     for number in range(15):
         given = fields(15, (2, 3, 4))

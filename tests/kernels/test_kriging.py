@@ -24,18 +24,18 @@ def pairs(count, dtype, seed=1):
     return listed.pairs(position, position, dtype=dtype)
 
 
-def weights(library, offsets, displacement, width=WIDTH, sited=True):
-    return kriging_weights(library, np.asarray(offsets), np.ascontiguousarray(displacement.T.numpy()), SUPPORT, NOISE,
+def weights(offsets, displacement, width=WIDTH, sited=True):
+    return kriging_weights(np.asarray(offsets), np.ascontiguousarray(displacement.T.numpy()), SUPPORT, NOISE,
                            *covariance(width), sited)
 
 
 @pytest.mark.parametrize("count, width, sited, dtype", [
     (2, WIDTH, True, torch.float64), (37, WIDTH, False, torch.float64), (37, WIDTH, False, torch.float32),
     (120, WIDTH, True, torch.float64), (60, WIDTH, True, torch.float32), (60, WIDTH / 30, True, torch.float64)])
-def test_weights(library, count, width, sited, dtype):
+def test_weights(count, width, sited, dtype):
     """Neighbours up to 1.2 filter widths away, where a series replaces the widest Gaussian, and farther."""
     listed = pairs(count, dtype)
-    compiled = weights(library, listed.offsets, listed.displacement, width, sited)
+    compiled = weights(listed.offsets, listed.displacement, width, sited)
     expected = solved(listed.offsets, listed.displacement, SUPPORT, width, sited)
     for one, other in zip(compiled if sited else compiled[1:], expected if sited else expected[1:]):
         assert len(one) == len(other) == 10
@@ -50,10 +50,10 @@ def test_weights_of_a_receiver_do_not_depend_on_the_others(library, dtype):
     """Bit for bit, so that they are the same on any number of ranks."""
     together = pairs(60, dtype)
     offsets = together.offsets.numpy()
-    own, others = weights(library, offsets, together.displacement)
+    own, others = weights(offsets, together.displacement)
     for receiver in range(len(offsets) - 1):
         listed = slice(offsets[receiver], offsets[receiver + 1])
-        own_alone, alone = weights(library, [0, listed.stop - listed.start], together.displacement[listed])
+        own_alone, alone = weights([0, listed.stop - listed.start], together.displacement[listed])
         assert np.array_equal(own_alone[:, 0], own[:, receiver])
         assert all(np.array_equal(row_alone, row[listed]) for row_alone, row in zip(alone, others))
 
@@ -64,8 +64,8 @@ def test_too_many_neighbours_give_nan_for_that_receiver_only(library, dtype):
     offsets, listed = torch.cat([few.offsets, few.offsets[-1:] + crowd]), int(few.offsets[-1])
     away = torch.from_numpy(np.random.default_rng(2).normal(0, 0.1, (crowd, 3))).to(dtype)
     displacement = torch.cat([few.displacement, away])
-    of_few = weights(library, few.offsets, few.displacement)
-    for own, others in (weights(library, offsets, displacement),
+    of_few = weights(few.offsets, few.displacement)
+    for own, others in (weights(offsets, displacement),
                         solved(offsets, displacement, SUPPORT, WIDTH)):
         own, others = np.stack([*own]), np.stack([*others])
         assert np.isnan(own[:, -1]).all() and np.isnan(others[:, listed:]).all()
@@ -75,7 +75,7 @@ def test_too_many_neighbours_give_nan_for_that_receiver_only(library, dtype):
 
 
 @pytest.mark.parametrize("rows, dtype", [(1, np.float64), (3, np.float32), (4, np.float64), (10, np.float32)])
-def test_weighted_sums(library, rows, dtype):
+def test_weighted_sums(rows, dtype):
     """Two fields; receivers with no neighbour up to some vectors of them; the weights of one are NaN."""
     random = np.random.default_rng(3)
     counts = np.array([0, 1, 15, 16, 17, 33, 64, 7, 0])
@@ -83,7 +83,7 @@ def test_weighted_sums(library, rows, dtype):
     field = random.standard_normal((40, 2)).astype(dtype)
     own, others = (list(random.standard_normal((rows, size)).astype(dtype)) for size in (9, len(senders)))
     others[-1][offsets[4] : offsets[5]] = np.nan
-    sums = weighted_sums(library, offsets, senders, own, others, field)
+    sums = weighted_sums(offsets, senders, own, others, field)
     assert sums.shape == (9, 2, rows) and sums.dtype == dtype
     for row in range(rows):
         expected = own[row][:, None].astype(float) * field[:9]

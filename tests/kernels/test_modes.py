@@ -8,7 +8,7 @@ from eddies.kernels.modes import ModePasses
 VECTORS = ("given", "modes", "direction", "applied", "solution", "residual")
 
 
-def set_up(library, shape, kind=np.float64):
+def set_up(shape, kind=np.float64):
     """The passes, their weights, an array for the preconditioner, and vectors by name."""
     random, (z, y, x) = np.random.default_rng(1), shape
     wavevector = [random.standard_normal(axis) for axis in ((1, 1, x), (1, y, 1), (z, 1, 1))]
@@ -17,7 +17,7 @@ def set_up(library, shape, kind=np.float64):
     weights = wavevector, random.integers(1, 3, (1, 1, x)).astype(float), inverse_squared, scale, penalty
     vectors = {name: (random.standard_normal((3, *shape)) + 1j * random.standard_normal((3, *shape))).astype(
         np.result_type(kind, np.complex64)) for name in VECTORS}
-    return ModePasses(library, *weights), weights, inverse, vectors
+    return ModePasses(*weights), weights, inverse, vectors
 
 
 def run(passes, inverse, vectors):
@@ -32,7 +32,7 @@ def run(passes, inverse, vectors):
 @pytest.mark.parametrize("kind, of_sums, of_modes", [(np.float64, 1e-13, 1e-14), (np.float32, 1e-7, 1e-6)])
 @pytest.mark.parametrize("shape", [(7, 0, 4), (33, 17, 17), (1, 1, 1)])
 def test_one_iteration(library, close, shape, kind, of_sums, of_modes):
-    passes, weights, inverse, vectors = set_up(library, shape, kind)
+    passes, weights, inverse, vectors = set_up(shape, kind)
     wavevector, multiplicity, inverse_squared, scale, penalty = weights
     sums, results = run(passes, inverse, vectors)
     exact = {name: vector.astype(complex) for name, vector in vectors.items()}

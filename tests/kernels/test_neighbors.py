@@ -8,8 +8,7 @@ from eddies.particles.periodic_box import PeriodicBox
 from tests.particles.configurations import CONFIGURATIONS, LENGTH, positions
 
 
-def listed(monkeypatch, library, box, radius, skin, receivers, senders, exclude_self):
-    monkeypatch.setattr("eddies.particles.neighbor_list.library", lambda: library)
+def listed(box, radius, skin, receivers, senders, exclude_self):
     neighbors = NeighborList(box, radius, skin)
     neighbors.build(receivers, senders, exclude_self)
     return neighbors
@@ -35,7 +34,7 @@ def test_neighbours_are_those_of_plain_distances(library, monkeypatch, kind, rad
     box, points = PeriodicBox(LENGTH, periodic_z), positions(kind, 128)
     others = positions("even", 64, seed=9) * torch.tensor([1, 1, 1.4]) - 0.2
     for receivers, exclude_self in ((points, True), (others, False)):
-        neighbors = listed(monkeypatch, library, box, radius, 0.1, receivers, points, exclude_self)
+        neighbors = listed(box, radius, 0.1, receivers, points, exclude_self)
         rows = torch.repeat_interleave(torch.arange(len(receivers)), neighbors.offsets.diff())
         listed_pairs = torch.zeros(len(receivers), len(points), dtype=torch.bool)
         listed_pairs[rows, neighbors.senders] = True
@@ -57,9 +56,9 @@ def test_neighbours_are_those_of_plain_distances(library, monkeypatch, kind, rad
                                                atol=4 * torch.finfo(dtype).eps)
 
 
-def test_without_receivers_or_senders(library, monkeypatch):
+def test_without_receivers_or_senders(library):
     some, none = positions(count=20), torch.zeros(0, 3, dtype=torch.float64)
     for receivers, senders in ((some, none), (none, some), (none, none)):
-        neighbors = listed(monkeypatch, library, PeriodicBox(LENGTH, False), 1.0, 0.0, receivers, senders, False)
+        neighbors = listed(PeriodicBox(LENGTH, False), 1.0, 0.0, receivers, senders, False)
         assert neighbors.offsets.tolist() == [0] * (len(receivers) + 1) and len(neighbors.senders) == 0
         assert len(neighbors.pairs(receivers, senders).sender) == 0

@@ -31,12 +31,6 @@ TERMS = {name: PAIR_MODELS[name] for name in ("published", "corrected", "antisym
 }
 
 
-@pytest.fixture
-def served(library, monkeypatch):
-    """Dynamics use that library."""
-    monkeypatch.setattr("eddies.particles.pairs.library", lambda: library)
-
-
 def set_up(terms, kind, cutoff=CUTOFF, count=128, dtype=torch.float64):
     flow = FlowUnits(SCALES, cutoff, NEIGHBORS) if cutoff != CUTOFF else FLOW
     slab, particles = alone(*state(count, kind=kind))
@@ -81,28 +75,28 @@ CASES = [(name, "even") for name in TERMS] + [("published", kind) for kind in CO
 
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("name, kind", CASES)
-def test_sums_and_gradients_are_those_of_torch(comm, served, monkeypatch, name, kind):
+def test_sums_and_gradients_are_those_of_torch(comm, library, monkeypatch, name, kind):
     compare(monkeypatch, *set_up(TERMS[name], kind), 1e-11, rows=torch.arange(3, 128, 7))
     compare(monkeypatch, *set_up(TERMS[name], kind), 1e-11)
 
 
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("cutoff", [3.0, 2.2, 0.7])
-def test_with_any_number_of_rows_of_cells(comm, served, monkeypatch, cutoff):
+def test_with_any_number_of_rows_of_cells(comm, library, monkeypatch, cutoff):
     """The box is at most one or two rows of cells across, or many; three with the other tests' cutoff."""
     compare(monkeypatch, *set_up(PAIR_MODELS["corrected"], "uneven", cutoff), 1e-11)
 
 
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("name", ["published", "antisymmetric", "sph"])
-def test_single_precision_differs_by_its_rounding(comm, served, monkeypatch, name):
+def test_single_precision_differs_by_its_rounding(comm, library, monkeypatch, name):
     """A sum has up to a hundred pairs of either sign, each rounded several times."""
     compare(monkeypatch, *set_up(TERMS[name], "even", dtype=torch.float32), 3e-5)
 
 
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("name", TERMS)
-def test_gradients_are_those_of_differences(comm, served, name):
+def test_gradients_are_those_of_differences(comm, library, name):
     """Gradients by positions, velocities, scalars and parameters, for every summand that has them."""
     dynamics, particles = set_up(TERMS[name], "cluster across a corner", count=14)
     for summand, term in summands_of(dynamics, particles):
@@ -133,9 +127,9 @@ def test_every_summand_of_the_library_belongs_to_a_term(comm, library):
     assert used | {"kernel-sum", "kernel-average"} == {name.decode() for name in names}
 
 
-def pairs_of(library, position, radius, wanted=None, scalars=(), dtype=np.float64, mutual=True):
+def pairs_of(position, radius, wanted=None, scalars=(), dtype=np.float64, mutual=True):
     count = len(position)
-    return CompiledPairs(library, PairSpace(LENGTH, True, radius, 1.0, 1.0, mutual), position, np.zeros((count, 3)),
+    return CompiledPairs(PairSpace(LENGTH, True, radius, 1.0, 1.0, mutual), position, np.zeros((count, 3)),
                          np.reshape(scalars, (-1, count)) if count else np.zeros((0, 0)),
                          np.ones(count, bool) if wanted is None else wanted, dtype)
 
@@ -144,7 +138,7 @@ def pairs_of(library, position, radius, wanted=None, scalars=(), dtype=np.float6
     ("unheard-of", (), 1, 0, 0), ("moments", (), 6, 0, 0), ("moments", (), 7, 1, 0),
     ("wcsph", (1.0, 1.0, 0.1), 3, 2, 1), ("pair-network", (2, 0, 0, 1, 0, 0, 0, 1, 0, 3), 6, 13, 0)])
 def test_summands_with_other_arguments_are_refused(library, kind, numbers, components, parameters, scalar):
-    pairs = pairs_of(library, np.zeros((2, 3)), 1.0, scalars=np.zeros((2, 2)))
+    pairs = pairs_of(np.zeros((2, 3)), 1.0, scalars=np.zeros((2, 2)))
     with pytest.raises(ValueError, match=kind):
         pairs.sums([Summand(kind, numbers, (1.0,) * components, scalar)], [np.zeros(parameters)])
 
@@ -156,7 +150,7 @@ def test_tanh_of_a_network(library, dtype, error):
     number = np.linspace(-12, 12, 2 * len(corner)).astype(dtype)
     number[:8] = 0, 1e-30, -1e-30, 1e-4, 1e4, -1e4, 7.999, 8.001
     # Each particle has one neighbour; one layer of one number outputs the tanh of the particle's own scalar.
-    pairs = pairs_of(library, np.concatenate([corner, corner + 0.1]), 0.2, scalars=number.astype(float), dtype=dtype,
+    pairs = pairs_of(np.concatenate([corner, corner + 0.1]), 0.2, scalars=number.astype(float), dtype=dtype,
                      mutual=False)
     network = Summand("pair-network", (1, 0, 1, 0, 0, 0, 0, 0, 0, 1), (1.0,))
     tanh = pairs.sums([network], [np.array([1.0, 0, 0, 1, 0])])[0][0]
@@ -166,9 +160,9 @@ def test_tanh_of_a_network(library, dtype, error):
 KERNEL_SUM = Summand("kernel-sum", kernel_numbers(CUTOFF, CubicSpline(CUTOFF).pieces.numpy()), (1.0,))
 
 
-def kernel_sums(library, position, **options):
+def kernel_sums(position, **options):
     """The sum of a kernel over the neighbours of each particle."""
-    return pairs_of(library, position, CUTOFF, **options).sums([KERNEL_SUM], [np.zeros(0)])[0][0]
+    return pairs_of(position, CUTOFF, **options).sums([KERNEL_SUM], [np.zeros(0)])[0][0]
 
 
 def value(distance):
@@ -176,7 +170,7 @@ def value(distance):
 
 
 def test_ten_thousand_particles_in_one_place(library):
-    sums = kernel_sums(library, np.full((10000, 3), 3.1), wanted=np.arange(10000) % 4000 == 7)
+    sums = kernel_sums(np.full((10000, 3), 3.1), wanted=np.arange(10000) % 4000 == 7)
     assert sums[7::4000] == pytest.approx([9999 * value(0.0)] * 3, rel=1e-12)
 
 
@@ -184,13 +178,13 @@ def test_a_pair_across_every_face_edge_and_corner(library):
     ends = 1e-9 + np.indices((2, 2, 2)).reshape(3, -1).T * (LENGTH - 2e-9)
     for direction in np.eye(3):
         for end in ends:
-            sums = kernel_sums(library, np.array([end - CUTOFF / 4 * direction, end + CUTOFF / 4 * direction]))
+            sums = kernel_sums(np.array([end - CUTOFF / 4 * direction, end + CUTOFF / 4 * direction]))
             assert sums == pytest.approx([value(CUTOFF / 2)] * 2, rel=1e-9)
 
 
 def test_without_pairs_sums_are_zero(library):
     for count in (0, 1):
-        assert np.array_equal(kernel_sums(library, np.full((count, 3), 0.2)), np.zeros(count))
+        assert np.array_equal(kernel_sums(np.full((count, 3), 0.2)), np.zeros(count))
 
 
 def test_positions_that_are_not_finite_and_missing_gradients_are_refused(library):
@@ -198,6 +192,6 @@ def test_positions_that_are_not_finite_and_missing_gradients_are_refused(library
         position = np.random.default_rng(1).uniform(0, LENGTH, (20, 3))
         position[7, 1] = wrong
         with pytest.raises(ValueError, match="particle 7"):
-            kernel_sums(library, position)
+            kernel_sums(position)
     with pytest.raises(ValueError, match="gradient"):
-        pairs_of(library, np.zeros((2, 3)), 1.0).gradients([KERNEL_SUM], [np.zeros(0)], [np.zeros((1, 2))], True)
+        pairs_of(np.zeros((2, 3)), 1.0).gradients([KERNEL_SUM], [np.zeros(0)], [np.zeros((1, 2))], True)

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from eddies.kernels import library
 from eddies.kernels.copies import ColumnCopies, Described, PlaneCopies
 from eddies.kernels.kriging import kriging_weights
-from eddies.kernels.library import instruction_sets, load
 from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand
 from eddies.kernels.splines import Splines
 from tests.kernels import test_flow as flow
@@ -23,9 +23,9 @@ CHECKOUT = Path(__file__).parents[2]
 PROGRAM = "import json\nfrom tests.kernels.test_threads import digests\nprint(json.dumps(digests()))"
 
 
-def copied(library):
+def copied():
     size = (144, 47, np.complex128)
-    planes, columns = (kind(library, *size) for kind in (PlaneCopies, ColumnCopies))
+    planes, columns = (kind(*size) for kind in (PlaneCopies, ColumnCopies))
     arrays = [noise(1, complex, 2, 4, 95, 48), noise(2, complex, 2, 144, 98), noise(3, complex, 144, 20, 48),
               noise(4, complex, 1, 95, 40, 48), noise(5, complex, 95)]
     blocks = planes.described_blocks(arrays[:1])
@@ -38,9 +38,9 @@ def copied(library):
     yield from arrays
 
 
-def formulas(library):
+def formulas():
     for precision in ("float64", "float32"):
-        grid, compiled = flow.set_up(library, precision, 60)
+        grid, compiled = flow.set_up(precision, 60)
         out = flow.fields(4, (2, 60, 120), precision)
         compiled.advection(flow.fields(15, (2, 60, 120), precision), 0.3, out)
         yield out
@@ -50,14 +50,14 @@ def formulas(library):
         yield compiled.sum_of_decays([(flow.factors(grid, 1, 1), flow.modes(grid, 3))])
 
 
-def mode_passes(library):
+def mode_passes():
     for kind in (np.float64, np.float32):
-        passes, _, inverse, vectors = modes.set_up(library, (33, 17, 17), kind)
+        passes, _, inverse, vectors = modes.set_up((33, 17, 17), kind)
         sums, results = modes.run(passes, inverse, vectors)
         yield from (np.array(sums), *results.values())
 
 
-def pair_sums(library):
+def pair_sums():
     random = np.random.default_rng(1)
     position, velocity = random.uniform(0, 1, (5000, 3)), random.standard_normal((5000, 3))
     network = (2, 1, 1, 1, 1, 1, 0, 1, 0, 9, 6)
@@ -66,29 +66,29 @@ def pair_sums(library):
     for kind in (np.float32, np.float64):
         for mutual in (True, False):
             space = PairSpace(1.0, mutual, 0.13, 0.1, 1.0, mutual)
-            pairs = CompiledPairs(library, space, position, velocity, random.standard_normal((1, 5000)),
+            pairs = CompiledPairs(space, position, velocity, random.standard_normal((1, 5000)),
                                   random.uniform(size=5000) < 0.9, kind)
             sums = pairs.sums(summands, parameters)
             by_parameters, by_columns = pairs.gradients(summands, parameters, sums, True)
             yield from (*sums, by_parameters[0], *by_columns)
 
 
-def splines(library):
+def splines():
     """Threads of spreading meet, also on lattices with an odd number of lines."""
     random = np.random.default_rng(7)
     for degree, cells, kind in ((3, 41, "f8"), (5, 18, "f8"), (3, 11, "f8"), (3, 41, "f4"), (5, 41, "f4")):
         positions, values = random.uniform(0, 20, (30000, 3)), random.standard_normal((30000, 3))
-        compiled, planes = Splines(library, degree, positions, padded_planes(cells)), parts(cells, kind=kind)
+        compiled, planes = Splines(degree, positions, padded_planes(cells)), parts(cells, kind=kind)
         compiled.spread(values, planes)
         yield from (compiled.at(planes), compiled.slope(planes, values), *planes)
 
 
-def kriging(library):
+def kriging():
     for kind in (np.float32, np.float64):
         random = np.random.default_rng(8)
         offsets = np.concatenate([[0], np.cumsum(random.integers(0, 40, 500))])
         displacement = random.uniform(-0.2, 0.2, (3, offsets[-1])).astype(kind)
-        own, others = kriging_weights(library, offsets, displacement, 0.4, 1e-2, 2.0, np.array([0.7, 0.3]))
+        own, others = kriging_weights(offsets, displacement, 0.4, 1e-2, 2.0, np.array([0.7, 0.3]))
         yield from (own, *others)
 
 
@@ -98,10 +98,12 @@ KERNELS = (copied, formulas, kriging, mode_passes, pair_sums, splines)
 def digests():
     """Digests of all bits that a kernel returns, by kernel and instruction set."""
     bits = {}
-    for kernel in KERNELS:
-        for name in instruction_sets():
+    for name in library.instruction_sets():
+        library.in_use = lambda name=name: name
+        library.library.cache_clear()
+        for kernel in KERNELS:
             digest = hashlib.sha256()
-            for array in kernel(load(name)):
+            for array in kernel():
                 assert np.abs(array).max() > 0
                 digest.update(array.tobytes())
             bits[f"{kernel.__name__} {name}"] = digest.hexdigest()
@@ -113,5 +115,5 @@ def test_the_same_bits_with_any_number_of_threads_and_from_run_to_run():
     first, *others = (json.loads(subprocess.run(
         [sys.executable, "-c", PROGRAM], cwd=CHECKOUT, timeout=120, check=True, capture_output=True, text=True,
         env={**os.environ, "OMP_NUM_THREADS": threads}).stdout) for threads in ("1", "3", "3"))
-    assert len(first) == len(KERNELS) * len(instruction_sets())
+    assert len(first) == len(KERNELS) * len(library.instruction_sets())
     assert all(digests == first for digests in others)

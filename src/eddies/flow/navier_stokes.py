@@ -8,7 +8,6 @@ import numpy as np
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.subgrid import Closure
 from eddies.kernels.flow import Formulas
-from eddies.kernels.library import library
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ScalarFunction, divided_difference
 
@@ -34,7 +33,7 @@ class Fluid:
     def __init__(self, grid: SpectralGrid, viscosity: float, sound_speed: float = math.inf,
                  forcing: LinearForcing | None = None, closure: Closure | None = None) -> None:
         self.grid, self.viscosity, self.sound_speed = grid, viscosity, sound_speed
-        self.forcing, self.closure, self._formulas = forcing, closure, Formulas(library(), grid.wavevector)
+        self.forcing, self.closure, self._formulas = forcing, closure, Formulas(grid.wavevector)
 
 
 class IncompressibleFluid(Fluid):

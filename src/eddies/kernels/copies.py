@@ -12,10 +12,10 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from eddies.kernels.library import ADDRESS, INT, NUMBER, members, require
+from eddies.kernels.library import ADDRESS, INT, NUMBER, library, members, require
 
 
-class _Blocks(ctypes.Structure):
+class Blocks(ctypes.Structure):
     """Blocks (components, planes, lines, width), the successive parts of one array along axis 1 or 2."""
 
     _fields_ = members(INT, "ranks planes lines width") + members(ADDRESS, "addresses starts")
@@ -51,16 +51,15 @@ class _Copies:
 
     exchanged_axis: int
 
-    def __init__(self, library: ctypes.CDLL, cells: int, cutoff: int, dtype: np.dtype) -> None:
-        self._library, self._dtype = library, np.dtype(dtype)
-        self._cells, self._cutoff, self._kept = cells, cutoff, 2 * cutoff + 1
+    def __init__(self, cells: int, cutoff: int, dtype: np.dtype) -> None:
+        self._cells, self._cutoff, self._kept, self._dtype = cells, cutoff, 2 * cutoff + 1, np.dtype(dtype)
 
-    def described_blocks(self, blocks: Sequence[np.ndarray]) -> _Blocks:
-        return _Blocks(blocks, self.exchanged_axis, self._dtype)
+    def described_blocks(self, blocks: Sequence[np.ndarray]) -> Blocks:
+        return Blocks(blocks, self.exchanged_axis, self._dtype)
 
     def _function(self, name: str, *arguments: type) -> Callable[..., None]:
         precision = "float64" if self._dtype == np.complex128 else "float32"
-        function = getattr(self._library, f"copies_{name}_{precision}")
+        function = getattr(library(), f"copies_{name}_{precision}")
         function.argtypes, function.restype = arguments, None
         return function
 
@@ -74,8 +73,8 @@ class ColumnCopies(_Copies):
 
     exchanged_axis = 1
 
-    def __init__(self, library: ctypes.CDLL, cells: int, cutoff: int, dtype: np.dtype) -> None:
-        super().__init__(library, cells, cutoff, dtype)
+    def __init__(self, cells: int, cutoff: int, dtype: np.dtype) -> None:
+        super().__init__(cells, cutoff, dtype)
         self._fill = self._function("fill_column", *5 * [INT], *3 * [ADDRESS])
         self._store = self._function("store_column", *5 * [INT], ADDRESS, NUMBER, ADDRESS)
         self._send = self._function("send_column", ADDRESS, *4 * [INT], ADDRESS)
@@ -91,11 +90,11 @@ class ColumnCopies(_Copies):
         sizes, start = self._sizes(modes, component, rows, column)
         self._store(*sizes, column.address, scale, start)
 
-    def send(self, column: Described, blocks: _Blocks, component: int, rows: slice) -> None:
+    def send(self, column: Described, blocks: Blocks, component: int, rows: slice) -> None:
         """Copy a column to blocks."""
         self._exchange(self._send, column, blocks, component, rows)
 
-    def receive(self, blocks: _Blocks, component: int, rows: slice, column: Described) -> None:
+    def receive(self, blocks: Blocks, component: int, rows: slice, column: Described) -> None:
         """Copy blocks to a column."""
         self._exchange(self._receive, column, blocks, component, rows)
 
@@ -105,7 +104,7 @@ class ColumnCopies(_Copies):
         start = modes.address + component * modes.strides[0] + rows.start * modes.strides[2]
         return (self._cutoff, self._cells, lines * width, column.shape[1] * width, column.apart), start
 
-    def _exchange(self, function: Callable[..., None], column: Described, blocks: _Blocks, component: int,
+    def _exchange(self, function: Callable[..., None], column: Described, blocks: Blocks, component: int,
                   rows: slice) -> None:
         function(ctypes.byref(blocks), component, rows.start, rows.stop - rows.start, column.apart, column.address)
 
@@ -122,14 +121,14 @@ class PlaneCopies(_Copies):
 
     exchanged_axis = 2
 
-    def __init__(self, library: ctypes.CDLL, cells: int, cutoff: int, dtype: np.dtype) -> None:
-        super().__init__(library, cells, cutoff, dtype)
+    def __init__(self, cells: int, cutoff: int, dtype: np.dtype) -> None:
+        super().__init__(cells, cutoff, dtype)
         self._pack = self._function("pack", ADDRESS, *3 * [INT], ADDRESS)
         self._unpack = self._function("unpack", ADDRESS, *5 * [INT], ADDRESS)
         self._fill = self._function("fill", *4 * [INT], *4 * [ADDRESS])
         self._split, self._join = (self._function(name, INT, *3 * [ADDRESS]) for name in ("split", "join"))
 
-    def pack(self, blocks: _Blocks, planes: slice) -> np.ndarray:
+    def pack(self, blocks: Blocks, planes: slice) -> np.ndarray:
         """Packed modes of some planes."""
         components, count = blocks.shape[0], planes.stop - planes.start
         packed = np.empty((components, (count + 1) // 2, self._kept, self._kept), self._dtype)
@@ -154,7 +153,7 @@ class PlaneCopies(_Copies):
                        rows.address)
             yield
 
-    def unpack(self, rows: Described, blocks: _Blocks, component: int, planes: slice) -> None:
+    def unpack(self, rows: Described, blocks: Blocks, component: int, planes: slice) -> None:
         """Store the modes of some `planes`, found in the output `rows` of the transform along y, in a component of
         blocks. The stored values are twice the modes."""
         self._unpack(ctypes.byref(blocks), component, planes.start, planes.stop - planes.start, self._cells,

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from eddies.kernels.library import ADDRESS, INT, NUMBER, address, members, require
+from eddies.kernels.library import ADDRESS, INT, NUMBER, address, library, members, require
 
 _ARGUMENTS = {"advection": (INT, INT, ADDRESS, NUMBER, INT, ADDRESS), "cross": (INT, INT, ADDRESS, INT, ADDRESS),
               "project": 3 * (ADDRESS,), "decays": (ADDRESS, INT, INT, *3 * (ADDRESS,)),
@@ -28,14 +28,14 @@ class Formulas:
     contiguous, and so must each field; ValueError otherwise.
     """
 
-    def __init__(self, library: ctypes.CDLL, wavevector: Sequence[np.ndarray]) -> None:
+    def __init__(self, wavevector: Sequence[np.ndarray]) -> None:
         self._wavevector = [np.ascontiguousarray(axis) for axis in wavevector]
         self._real = self._wavevector[0].dtype
         self._complex = np.result_type(self._real, np.complex64)
         x, y, z = (axis.size for axis in wavevector)
         self._shape, self._modes = (z, y, x), _Modes(x - 1, y, *map(address, self._wavevector))
         for name, arguments in _ARGUMENTS.items():
-            function = getattr(library, f"flow_{name}_{self._real}")
+            function = getattr(library(), f"flow_{name}_{self._real}")
             function.argtypes, function.restype = arguments, None
             setattr(self, f"_{name}", function)
 

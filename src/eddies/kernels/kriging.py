@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from eddies.kernels.library import ADDRESS, INT, NUMBER, address, members, require
+from eddies.kernels.library import ADDRESS, INT, NUMBER, address, library, members, require
 
 # Largest number of neighbours of a receiver. The equations of up to 16 receivers are solved together; with this number
 # of neighbours they take 64 MB in single precision.
@@ -24,9 +24,8 @@ class _Sums(ctypes.Structure):
     _fields_ = members(INT, "receivers rows columns") + members(ADDRESS, "offsets senders own weights field result")
 
 
-def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.ndarray, support: float, noise: float,
-                    slowest: float, amplitudes: np.ndarray,
-                    sited: bool = True) -> tuple[np.ndarray, list[np.ndarray]]:
+def kriging_weights(offsets: np.ndarray, displacement: np.ndarray, support: float, noise: float, slowest: float,
+                    amplitudes: np.ndarray, sited: bool = True) -> tuple[np.ndarray, list[np.ndarray]]:
     """Weights of n receivers' own values, (10, n), and of their neighbours' values, ten arrays (m,) for m pairs.
 
     `eddies.particles.kriging.kriging_weights` defines them. The ten arrays are separate so that each is small enough
@@ -48,11 +47,11 @@ def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.
     rows = np.array([address(row) for row in weights], np.uint64)
     given = _Kriging(len(offsets) - 1, pairs, sited, address(offsets), address(displacement), support, noise,
                      MOST_NEIGHBORS, len(amplitudes), slowest, *map(address, (amplitudes, own, rows)))
-    getattr(library, f"kriging_{dtype}")(ctypes.byref(given))
+    getattr(library(), f"kriging_{dtype}")(ctypes.byref(given))
     return own, weights
 
 
-def weighted_sums(library: ctypes.CDLL, offsets: np.ndarray, senders: np.ndarray, own: Sequence[np.ndarray] | None,
+def weighted_sums(offsets: np.ndarray, senders: np.ndarray, own: Sequence[np.ndarray] | None,
                   weights: Sequence[np.ndarray], field: np.ndarray) -> np.ndarray:
     """own_i f_i + sum_j weights_ij f_j, (n, c, rows), for one, three, four or ten rows of weights.
 
@@ -73,5 +72,5 @@ def weighted_sums(library: ctypes.CDLL, offsets: np.ndarray, senders: np.ndarray
     of_own, of_weights = (np.array([address(row) for row in some], np.uint64) for some in (own, weights))
     given = _Sums(receivers, rows, field.shape[1], address(offsets), address(senders),
                   address(of_own) if sited else None, *map(address, (of_weights, field, result)))
-    getattr(library, f"weighted_sums_{dtype}")(ctypes.byref(given))
+    getattr(library(), f"weighted_sums_{dtype}")(ctypes.byref(given))
     return result

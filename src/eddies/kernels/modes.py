@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from eddies.kernels.library import ADDRESS, INT, address, members, require
+from eddies.kernels.library import ADDRESS, INT, address, library, members, require
 
 
 class _Weights(ctypes.Structure):
@@ -27,9 +27,9 @@ class ModePasses:
         `scale`.
     """
 
-    def __init__(self, library: ctypes.CDLL, wavevector: Sequence[np.ndarray], multiplicity: np.ndarray,
-                 inverse_squared: np.ndarray, scale: np.ndarray, penalty: np.ndarray) -> None:
-        self._library, self._shape, self._kind = library, scale.shape, scale.dtype
+    def __init__(self, wavevector: Sequence[np.ndarray], multiplicity: np.ndarray, inverse_squared: np.ndarray,
+                 scale: np.ndarray, penalty: np.ndarray) -> None:
+        self._shape, self._kind = scale.shape, scale.dtype
         self._arrays = [np.ascontiguousarray(array, self._kind)
                         for array in (*wavevector, multiplicity, inverse_squared, scale, penalty)]
         z, y, x = self._shape
@@ -58,7 +58,7 @@ class ModePasses:
             require(array, self._shape, self._kind)
         for vector in vectors:
             require(vector, (3, *self._shape), np.result_type(self._kind, np.complex64))
-        function = getattr(self._library, f"{name}_{self._kind}")
+        function = getattr(library(), f"{name}_{self._kind}")
         function.restype = result
         return function(ctypes.byref(self._weights), *map(ctypes.c_double, given[:1]),
                         *(ctypes.c_void_p(address(array)) for array in (*given[1:], *vectors)))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from eddies.kernels.library import ADDRESS, INT, NUMBER, address, members
+from eddies.kernels.library import ADDRESS, INT, NUMBER, address, library, members
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class _Listed(ctypes.Structure):
                 + members(ADDRESS, "first receiver segment sender displacement distance"))
 
 
-def neighbors_within(library: ctypes.CDLL, box: Box, radius: float, receivers: np.ndarray, senders: np.ndarray,
+def neighbors_within(box: Box, radius: float, receivers: np.ndarray, senders: np.ndarray,
                      exclude_self: bool) -> tuple[np.ndarray, np.ndarray]:
     """Find the senders (s, 3) within a radius of each receiver (n, 3). Returns `offsets` (n + 1,) and `rows` (m,).
 
@@ -41,15 +41,15 @@ def neighbors_within(library: ctypes.CDLL, box: Box, radius: float, receivers: n
     offsets = np.empty(len(receivers) + 1, np.int64)
     search = _Search(len(receivers), len(senders), address(receivers), address(senders), box.length, box.periodic_z,
                      radius, exclude_self, address(offsets))
-    library.neighbors_find.restype = ctypes.c_void_p
-    handle = library.neighbors_find(ctypes.byref(search))
+    library().neighbors_find.restype = ctypes.c_void_p
+    handle = library().neighbors_find(ctypes.byref(search))
     rows = np.empty(offsets[-1], np.int64)
-    library.neighbors_take(ctypes.c_void_p(handle), ctypes.c_void_p(address(rows)))
+    library().neighbors_take(ctypes.c_void_p(handle), ctypes.c_void_p(address(rows)))
     return offsets, rows
 
 
-def pairs_within(library: ctypes.CDLL, box: Box, radius: float, receivers: np.ndarray, senders: np.ndarray,
-                 offsets: np.ndarray, listed: np.ndarray, rows: np.ndarray, kind: np.dtype) -> tuple[np.ndarray, ...]:
+def pairs_within(box: Box, radius: float, receivers: np.ndarray, senders: np.ndarray, offsets: np.ndarray,
+                 listed: np.ndarray, rows: np.ndarray, kind: np.dtype) -> tuple[np.ndarray, ...]:
     """Find those pairs of a neighbour list that lie within `radius` at the given positions, for some receivers.
 
     `rows` (k,) are the indices of these receivers. `offsets` and `listed` are the result of `neighbors_within`. Returns
@@ -60,10 +60,10 @@ def pairs_within(library: ctypes.CDLL, box: Box, radius: float, receivers: np.nd
     rows, first = np.ascontiguousarray(rows, np.int64), np.empty(len(rows) + 1, np.int64)
     given = _Listed(len(rows), *map(address, (rows, offsets, listed, receivers, senders)), box.length,
                     box.periodic_z, radius, address(first))
-    library.neighbors_count(ctypes.byref(given))
+    library().neighbors_count(ctypes.byref(given))
     indices, count = np.empty((3, first[-1]), np.int64), first[-1]
     displacement, distance = np.empty((3, count), kind), np.empty(count, kind)
     given.receiver, given.segment, given.sender = map(address, indices)
     given.displacement, given.distance = address(displacement), address(distance)
-    getattr(library, f"neighbors_fill_{np.dtype(kind)}")(ctypes.byref(given))
+    getattr(library(), f"neighbors_fill_{np.dtype(kind)}")(ctypes.byref(given))
     return *indices, displacement, distance

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from eddies.kernels.library import ADDRESS, INT, NUMBER, address, members
+from eddies.kernels.library import ADDRESS, INT, NUMBER, address, library, members
 
 MOST_SCALARS = 4
 # Results of a library function. Any other result is the number of the first particle whose position is not finite.
@@ -62,14 +62,14 @@ class CompiledPairs:
     particles, in the units of the summands. Raises ValueError for other shapes.
     """
 
-    def __init__(self, library: ctypes.CDLL, space: PairSpace, position: np.ndarray, velocity: np.ndarray,
-                 scalars: np.ndarray, wanted: np.ndarray, kind: np.dtype) -> None:
+    def __init__(self, space: PairSpace, position: np.ndarray, velocity: np.ndarray, scalars: np.ndarray,
+                 wanted: np.ndarray, kind: np.dtype) -> None:
         count = len(position)
         if position.shape != (count, 3) or velocity.shape != (count, 3) or wanted.shape != (count,) or \
                 scalars.shape[1:] != (count,) or len(scalars) > MOST_SCALARS:
             raise ValueError(f"columns {position.shape}, {velocity.shape}, {scalars.shape}, {wanted.shape} do not "
                              "belong to one set of particles")
-        self._library, self._kind, self._count = library, np.dtype(kind), count
+        self._kind, self._count = np.dtype(kind), count
         self._columns = [np.ascontiguousarray(column, np.float64) for column in (position, velocity, scalars)]
         self._columns.append(np.ascontiguousarray(wanted, np.uint8))
         self._particles = _Particles(
@@ -113,7 +113,7 @@ class CompiledPairs:
             setattr(given, field, address(columns))
             if by_parameters:
                 given.by_parameters = address(by_parameters[number])
-        function = getattr(self._library, f"{name}_{self._kind}")
+        function = getattr(library(), f"{name}_{self._kind}")
         function.restype = INT
         result = function(ctypes.byref(self._particles), INT(len(summands)), structures, *more)
         if result != DONE:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from eddies.kernels.library import ADDRESS, INT, NUMBER, address, members
+from eddies.kernels.library import ADDRESS, INT, NUMBER, address, library, members
 from eddies.kernels.neighbors import Box
 
 FITS = {1: "fit_linear", 2: "fit_quadratic"}
@@ -46,7 +46,7 @@ def kernel_numbers(support: float, pieces: np.ndarray, signed: bool = False) -> 
     return support, -np.inf if signed else 0.0, *map(float, pieces.shape), *map(float, pieces.ravel())
 
 
-def sums_on_grid(library: ctypes.CDLL, grid: GridPlanes, numbers: tuple[float, ...], position: np.ndarray,
+def sums_on_grid(grid: GridPlanes, numbers: tuple[float, ...], position: np.ndarray,
                  columns: np.ndarray) -> np.ndarray:
     """Sums over particles x_j (n, 3) of c_j W(x - x_j), for columns c (n, 4), at points x of the planes: (points, 4).
 
@@ -58,13 +58,12 @@ def sums_on_grid(library: ctypes.CDLL, grid: GridPlanes, numbers: tuple[float, .
     sums, kernel = np.empty((grid.planes * grid.cells**2, 4), columns.dtype), np.array(numbers)
     given = _Reconstruction(len(position), grid.cells, grid.first, grid.planes, grid.periodic_z, grid.spacing,
                             numbers[0], *map(address, (position, kernel, columns, sums)))
-    getattr(library, f"reconstruction_sums_{columns.dtype}")(ctypes.byref(given))
+    getattr(library(), f"reconstruction_sums_{columns.dtype}")(ctypes.byref(given))
     return sums
 
 
-def fitted(library: ctypes.CDLL, box: Box, degree: int, numbers: tuple[float, ...], volume: float, ridge: float,
-           offsets: np.ndarray, senders: np.ndarray, receivers: np.ndarray, positions: np.ndarray,
-           values: np.ndarray) -> np.ndarray:
+def fitted(box: Box, degree: int, numbers: tuple[float, ...], volume: float, ridge: float, offsets: np.ndarray,
+           senders: np.ndarray, receivers: np.ndarray, positions: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Moving least squares fit of a vector at each receiver, (n, 4, 3): the vector, then its x, y and z derivatives.
 
     `eddies.particles.particle_field.ParticleField.fitted` defines the fit. `numbers` are the weight W as
@@ -78,5 +77,5 @@ def fitted(library: ctypes.CDLL, box: Box, degree: int, numbers: tuple[float, ..
     result = np.empty((len(receivers), 4, 3))
     given = _Fit(len(receivers), box.periodic_z, box.length, volume, ridge,
                  *map(address, (offsets, senders, receivers, positions, values, kernel, result)))
-    getattr(library, FITS[degree])(ctypes.byref(given))
+    getattr(library(), FITS[degree])(ctypes.byref(given))
     return result

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from eddies.kernels.library import ADDRESS, INT, NUMBER, address, members
+from eddies.kernels.library import ADDRESS, INT, NUMBER, address, library, members
 
 # Padding of `fraction` along each axis, since the library may read beyond the last point; the same in splines.cpp.
 PADDING = 8
@@ -47,16 +47,16 @@ class Splines:
     once, in the constructor. Raises MisplacedPoint.
     """
 
-    def __init__(self, library: ctypes.CDLL, degree: int, positions: np.ndarray, padded: PaddedPlanes) -> None:
-        self._library, self._padded, count = library, padded, len(positions)
+    def __init__(self, degree: int, positions: np.ndarray, padded: PaddedPlanes) -> None:
+        self._padded, count = padded, len(positions)
         positions = np.ascontiguousarray(positions, np.float64)  # a copy must live until the call has ended
         self._arrays = {"order": np.empty(count, np.int32), "first": np.empty((count, 3), np.int32),
                         "fraction": np.zeros((3, count + PADDING)),
-                        "starts": np.empty(library.splines_bins(padded.cells, padded.planes) + 1, np.int64)}
+                        "starts": np.empty(library().splines_bins(padded.cells, padded.planes) + 1, np.int64)}
         self._cloud = _Cloud(count, padded.cells, padded.planes, degree, *map(address, self._arrays.values()))
-        library.splines_arrange.restype = INT
-        misplaced = library.splines_arrange(ctypes.byref(self._cloud), ADDRESS(address(positions)),
-                                            NUMBER(padded.spacing), INT(padded.lowest))
+        library().splines_arrange.restype = INT
+        misplaced = library().splines_arrange(ctypes.byref(self._cloud), ADDRESS(address(positions)),
+                                              NUMBER(padded.spacing), INT(padded.lowest))
         if misplaced >= 0:
             raise MisplacedPoint(misplaced)
 
@@ -88,7 +88,7 @@ class Splines:
             raise ValueError(f"{planes.shape[1]} planes, columns of {[len(column) for column in columns]}: "
                              f"{self._padded.planes} planes and {self._cloud.points} points are needed")
         arguments = [ADDRESS(address(array)) for array in (planes, *columns)]
-        getattr(self._library, f"{name}_{kind}")(ctypes.byref(self._cloud), INT(len(planes)), *arguments)
+        getattr(library(), f"{name}_{kind}")(ctypes.byref(self._cloud), INT(len(planes)), *arguments)
 
 
 def _contiguous(parts: Sequence[np.ndarray]) -> list[np.ndarray]:

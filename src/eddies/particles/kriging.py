@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from eddies.kernels import kriging as compiled
-from eddies.kernels.library import library
 from eddies.particles.pairs import Pairs
 
 # Rows of the weights: OWN is for the field itself, FIRST for its first derivatives, and SECOND for its second
@@ -51,7 +50,7 @@ def interpolated(pairs: Pairs, support: float, filter_width: float, values: Tens
     solved, and zero where no particle lies within the support.
     """
     _, weights = kriging_weights(pairs, support, filter_width, sited=False)
-    sums = torch.from_numpy(compiled.weighted_sums(library(), pairs.offsets.numpy(), pairs.sender.numpy(), None,
+    sums = torch.from_numpy(compiled.weighted_sums(pairs.offsets.numpy(), pairs.sender.numpy(), None,
                                                    weights[UP_TO_FIRST],
                                                    values.to(pairs.displacement.dtype).contiguous().numpy()))
     return sums[..., OWN], sums[..., FIRST]
@@ -76,7 +75,7 @@ def kriging_weights(pairs: Pairs, support: float, filter_width: float,
     cannot be solved or a receiver has more than MOST_NEIGHBORS neighbours.
     """
     displacement = np.ascontiguousarray(pairs.displacement.detach().cpu().T.numpy())
-    return compiled.kriging_weights(library(), pairs.offsets.cpu().numpy(), displacement, support, NOISE,
+    return compiled.kriging_weights(pairs.offsets.cpu().numpy(), displacement, support, NOISE,
                                     *covariance(filter_width), sited)
 
 
@@ -139,7 +138,7 @@ class Kriging:
             rows = [own_row[:, None] * seen[: len(own_row)] + self._matrix(row) @ seen
                     for own_row, row in zip(own, others)]
             return torch.stack(rows, -1).to(field.device)
-        rows = compiled.weighted_sums(library(), self._offsets.numpy(), self._senders.numpy(), own.numpy(),
+        rows = compiled.weighted_sums(self._offsets.numpy(), self._senders.numpy(), own.numpy(),
                                       [row.numpy() for row in others], seen.detach().contiguous().numpy())
         return torch.from_numpy(rows).to(field.device)
 

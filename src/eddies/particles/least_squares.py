@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eddies.kernels.library import library
 from eddies.kernels.modes import ModePasses
 from eddies.parallel.reduction import global_sum
 from eddies.particles.fourier_grid import FourierGrid, Points
@@ -53,8 +52,8 @@ class LeastSquares:
         self.grid, self.inside, self.penalty = grid, inside, penalty.to(grid.dtype)
         self._inside = inside.to(grid.dtype)
         scale = torch.where(inside, grid.prefilter * grid.spectral.cells**3, 0.0)
-        self._passes = ModePasses(library(), grid.spectral.wavevector, grid.spectral.multiplicity,
-                                  grid.inverse_squared.numpy(), scale.numpy(), self.penalty.numpy())
+        self._passes = ModePasses(grid.spectral.wavevector, grid.spectral.multiplicity, grid.inverse_squared.numpy(),
+                                  scale.numpy(), self.penalty.numpy())
 
     def gathered(self, values: Tensor, points: Points) -> Tensor:
         """P B^T of values (n, 3) at points; collective, differentiable."""

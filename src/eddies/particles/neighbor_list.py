@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eddies.kernels.library import library
 from eddies.kernels.neighbors import neighbors_within, pairs_within
 from eddies.particles.devices import kernels_serve
 from eddies.particles.pairs import Pairs, gather_rows
@@ -48,7 +47,7 @@ class NeighborList:
             raise ValueError("neighbour list: a position is not finite")
         # The radius is slightly larger, so only `pairs` decides which pairs count, alike for (i, j) and (j, i).
         reach = (self.cutoff + self.skin) * (1 + 1e-9)
-        columns = neighbors_within(library(), self.box, reach, as_numpy(receivers), as_numpy(senders), exclude_self)
+        columns = neighbors_within(self.box, reach, as_numpy(receivers), as_numpy(senders), exclude_self)
         self.offsets, self.senders = (torch.from_numpy(column).to(receivers.device) for column in columns)
 
     def blocks(self, together: int) -> Iterator[slice]:
@@ -93,7 +92,7 @@ class NeighborList:
 
     def _compiled_pairs(self, receivers: Tensor, senders: Tensor, numbers: Tensor, dtype: torch.dtype) -> Pairs:
         kind = np.dtype(str(dtype).removeprefix("torch."))
-        columns = pairs_within(library(), self.box, self.cutoff, as_numpy(receivers), as_numpy(senders),
+        columns = pairs_within(self.box, self.cutoff, as_numpy(receivers), as_numpy(senders),
                                self.offsets.numpy(), self.senders.numpy(), numbers.numpy(), kind)
         receiver, segment, sender, displacement, distance = map(torch.from_numpy, columns)
         return Pairs(receiver, segment, sender, displacement.T, distance, len(numbers))

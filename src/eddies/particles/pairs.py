@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eddies.kernels.library import library
 from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand
 from eddies.particles import moments
 from eddies.particles.flow_units import FlowUnits
@@ -209,7 +208,7 @@ class _PairSums(torch.autograd.Function):
     def forward(ctx, space: PairSpace, summands: list[Summand], wanted: np.ndarray, dtype: torch.dtype,
                 position: Tensor, velocity: Tensor, scalars: Tensor, *parameters: Tensor) -> tuple[Tensor, ...]:
         kind = np.dtype(str(dtype).removeprefix("torch."))
-        ctx.pairs = CompiledPairs(library(), space, *map(_numbers, (position, velocity, scalars)), wanted, kind)
+        ctx.pairs = CompiledPairs(space, *map(_numbers, (position, velocity, scalars)), wanted, kind)
         ctx.summands = summands
         ctx.save_for_backward(position, velocity, scalars, *parameters)
         return tuple(map(torch.from_numpy, ctx.pairs.sums(summands, list(map(_numbers, parameters)))))

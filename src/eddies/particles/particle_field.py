@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eddies.kernels.library import library
 from eddies.kernels.pairs import PairSpace
 from eddies.kernels.reconstruction import GridPlanes, fitted, sums_on_grid, kernel_numbers
 from eddies.parallel.halo import HaloExchange
@@ -112,8 +111,7 @@ class ParticleField:
         slab, volume = self.decomposition, self.volumes(kernel)
         weighted = volume.unsqueeze(1) * torch.cat([torch.ones_like(volume).unsqueeze(1), self._velocity], dim=1)
         planes = GridPlanes(slab.planes, slab.spacing, slab.start, slab.count, self._box.periodic_z)
-        sums = torch.from_numpy(sums_on_grid(library(), planes, _for_library(kernel), self._position.numpy(),
-                                             weighted.numpy()))
+        sums = torch.from_numpy(sums_on_grid(planes, _for_library(kernel), self._position.numpy(), weighted.numpy()))
         return sums[:, 1:] * normalisation(kernel, sums[:, :1])
 
     @torch.no_grad()
@@ -130,9 +128,8 @@ class ParticleField:
         weight W. It is zero where no particle lies within the support.
         """
         neighbors = self._neighbors_of(receivers)
-        values = fitted(library(), self._box, degree, _for_library(kernel), mean_volume, RIDGE,
-                        neighbors.offsets.numpy(), neighbors.senders.numpy(), receivers.numpy(),
-                        self._position.numpy(), self._velocity.numpy())
+        values = fitted(self._box, degree, _for_library(kernel), mean_volume, RIDGE, neighbors.offsets.numpy(),
+                        neighbors.senders.numpy(), receivers.numpy(), self._position.numpy(), self._velocity.numpy())
         result = torch.from_numpy(values).to(self.dtype)
         return result[:, 0], result[:, 1:].transpose(1, 2)
 

@@ -9,14 +9,13 @@ All plans use FFTW_ESTIMATE: measured plans may differ from run to run, and with
 
 import itertools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pyfftw
 
 from eddies.cores import threads
-from eddies.kernels.copies import ColumnCopies, Described, PlaneCopies
-from eddies.kernels.library import library
+from eddies.kernels.copies import Blocks, ColumnCopies, Described, PlaneCopies
 
 BLOCK_BYTES = 2**18  # size of a block per component and thread: a few blocks fit the second-level cache of a core
 CACHE_LINE = 64
@@ -41,7 +40,7 @@ class ColumnPass:
 
     def __init__(self, cells: int, cutoff: int, dtype: np.dtype) -> None:
         self.cells, self.width, self.dtype = cells, cutoff + 1, np.dtype(dtype)
-        self.copies = ColumnCopies(library(), cells, cutoff, self.dtype)
+        self.copies = ColumnCopies(cells, cutoff, self.dtype)
         self._plans: dict[tuple[str, int], ColumnPlan] = {}
 
     def rows(self, count: int) -> list[slice]:
@@ -87,7 +86,7 @@ class PlanePass:
 
     def __init__(self, cells: int, cutoff: int, dtype: np.dtype) -> None:
         self.cells, self.cutoff, self.dtype = cells, cutoff, np.dtype(dtype)
-        self.copies = PlaneCopies(library(), cells, cutoff, self.dtype)
+        self.copies = PlaneCopies(cells, cutoff, self.dtype)
         self._plans: dict[tuple[str, int, int], PlanePlans] = {}
 
     def blocks(self, count: int) -> list[slice]:
@@ -109,11 +108,10 @@ class PlanePass:
                 plan.execute()
         return plans
 
-    def to_modes(self, plans: PlanePlans, blocks: Any, component: int, planes: slice) -> None:
+    def to_modes(self, plans: PlanePlans, blocks: Blocks, component: int, planes: slice) -> None:
         """Transform the planes in the memory of `plans`, and store twice their modes, not normalised, in `blocks`.
 
-        The first field becomes the component with the number `component`, and the others follow. `blocks` has the form
-        that `self.copies` takes.
+        The first field becomes the component with the number `component`, and the others follow.
         """
         for number, of_field in enumerate(plans.plans, component):
             for plan in of_field:

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from eddies.kernels.library import library
 from eddies.kernels.splines import MisplacedPoint, PaddedPlanes, Splines
 from eddies.parallel.halo import HaloError, PlaneHalo
 from eddies.spectral.spectral_grid import SpectralGrid
@@ -56,7 +55,7 @@ class SplineInterpolation:
         if z is farther outside, and ValueError if a position is not finite.
         """
         try:
-            return Splines(library(), self.degree, positions, self._padded)
+            return Splines(self.degree, positions, self._padded)
         except MisplacedPoint as error:
             position = np.asarray(positions)[error.number]
         if not np.isfinite(position).all():

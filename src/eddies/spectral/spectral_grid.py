@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eddies.kernels.copies import Described
+from eddies.kernels.copies import Blocks, Described
 from eddies.kernels.library import require
 from eddies.parallel.migration import Redistribution
 from eddies.parallel.reduction import global_sum
@@ -27,8 +27,8 @@ class _Batch(NamedTuple):
     """A transpose for a batch of components, and its blocks as ColumnCopies and PlaneCopies take them."""
 
     transpose: Transpose
-    columns: Any
-    planes: Any
+    columns: Blocks
+    planes: Blocks
 
 
 class SpectralGrid(ModeOperators):
