@@ -3,7 +3,7 @@
 import numpy as np
 
 from eddies.io.fields import FieldWriter
-from eddies.io.hdf5 import create_product, write_attributes, write_table
+from eddies.io.hdf5 import create_product, write_table
 from eddies.io.trajectories import TrajectoryWriter
 from eddies.io.weights import save_weights
 from eddies.particles.smoothing_kernels import KernelNetwork
@@ -22,7 +22,7 @@ COMPRESSIBLE = ("mach_turbulent", "density_rms", "compressible_fraction")
 
 
 class RandomFlow:
-    """A random solenoidal velocity with |k| <= 4, its gradient and its decay, known at every point."""
+    """A random solenoidal velocity with |k| <= 4 that decays, known at every point."""
 
     def __init__(self, seed: int, modes: int = 90) -> None:
         rng = np.random.default_rng(seed)
@@ -39,10 +39,6 @@ class RandomFlow:
 
     def velocity(self, position, time):
         return np.exp(-0.2 * time) * np.cos(self._angle(position, time)) @ self.amplitude
-
-    def gradient(self, position, time):
-        rates = -np.sin(self._angle(position, time)) * np.exp(-0.2 * time)
-        return np.einsum("pm,mi,mj->pij", rates, self.amplitude, self.k)
 
     def acceleration(self, position, time):
         interval = 1e-3
@@ -81,26 +77,31 @@ def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, statio
         if frames:
             write_tracers(file, frames, density, total)
         if forced:
-            write_attributes(file.create_group("forcing"), {"injection_rate": 0.5, "wavenumber": 2.0})
+            file.create_group("forcing").attrs.update({"injection_rate": 0.5, "wavenumber": 2.0})
         energy = np.outer(wiggle, decaying_spectra()["energy"][0])
         write_table(file, "spectra_of_statistics", {"wavenumber": np.arange(energy.shape[1]), "energy": energy})
         if stationary:
-            write_attributes(file.create_group("stationary"), {"start": 1.0, "end": 3.0})
-        write_attributes(file.create_group("reference"), reference)
+            file.create_group("stationary").attrs.update({"start": 1.0, "end": 3.0})
+        file.create_group("reference").attrs.update(reference)
 
 
 def write_tracers(file, frames, density, total):
-    """Write frames of tracers, which are at `places` at the start of the rollout."""
+    """Write frames of tracers, which are `particles` without an error."""
     shapes = {"position": (3,), "velocity": (3,)} | ({"density": ()} if density else {})
-    flow, start = PerturbedFlow(0.0), places(total)
     writer = TrajectoryWriter(file, "tracers", total, LENGTH, shapes, np.float64, images=True)
     for step, time in enumerate(np.linspace(0, 1.2, frames)):
-        writer.append(step, time, 0, flow.particles(start, time - START))
+        writer.append(step, time, 0, particles(total, time - START))
 
 
-def places(total):
-    """Positions of particles at the start of the rollout."""
-    return np.random.default_rng(5).uniform(0, LENGTH, (total, 3))
+def particles(total, time, growth=0.0):
+    """All columns of particles that moved from random places with their present velocity, at a time since the start of
+    the rollout. The velocity is that of the truth plus an error that grows linearly in time."""
+    truth, error = RandomFlow(1), RandomFlow(4)
+    start = np.random.default_rng(5).uniform(0, LENGTH, (total, 3))
+    velocity = truth.velocity(start, time) + growth * time * error.velocity(start, time)
+    acceleration = truth.acceleration(start, time) + growth * time * error.acceleration(start, time)
+    return {"position": (start + time * velocity) % LENGTH, "velocity": velocity,
+            "density": 1 + 0.01 * velocity[:, 0], "acceleration": acceleration}
 
 
 def decaying_spectra():
@@ -111,8 +112,8 @@ def decaying_spectra():
     return {"time": time, "wavenumber": k, "energy": energy, "filtered": filtered}
 
 
-def write_kernel(comm, directory, cells=32, seed=1):
-    r = np.linspace(0, 1, 101)
+def write_kernel(comm, directory, seed=1):
+    r, cells = np.linspace(0, 1, 101), 32
     shapes = {"learned": np.exp(-5 * r**2) * (1 - r) ** 2,
               "learned_no_gradient": np.exp(-9 * (r - 0.4) ** 2) * (1 - r),
               "cubic_spline": (1 - r) ** 3, "wendland": (1 - r) ** 4 * (1 + 4 * r)}
@@ -127,11 +128,7 @@ def write_kernel(comm, directory, cells=32, seed=1):
             error = errors[f"{quantity}_error_{name}"] = 0.1 + 0.1 * index
             noise = np.random.default_rng(index).normal(size=values.shape)
             slices[f"{quantity}_{name}"] = values + error * values.std() * noise
-    step = np.arange(0, 200, 10)
-    history = {"step": step, "loss_learned": np.exp(-step / 60),
-               "velocity_learned": 0.4 * np.exp(-step / 60), "gradient_learned": 0.6 * np.exp(-step / 60),
-               "loss_learned_no_gradient": np.exp(-step / 40)}
-    tables = {"kernels": kernels, "slices": slices, "errors": errors, "history": history}
+    tables = {"kernels": kernels, "slices": slices, "errors": errors}
     network = KernelNetwork(1.4, [4], "smooth", seed)
     description = {"form": network.formula, "support": 1.4, "hidden": [4], "cutoff": "smooth"}
     weights = {name: tensor.numpy() for name, tensor in network.float().state_dict().items()}
@@ -167,23 +164,6 @@ def write_model(comm, directory, terms=("pressure", "pairs"), source=None):
                  {"weight": np.ones(3)}, origin, tables)
 
 
-class PerturbedFlow:
-    """The truth plus an error that grows linearly in time."""
-
-    def __init__(self, growth):
-        self.truth, self.error, self.growth = RandomFlow(1), RandomFlow(4), growth
-
-    def __getattr__(self, quantity):
-        truth, error = getattr(self.truth, quantity), getattr(self.error, quantity)
-        return lambda where, time: truth(where, time) + self.growth * time * error(where, time)
-
-    def particles(self, start, time):
-        """All columns of particles that moved from `start` with their present velocity."""
-        velocity = self.velocity(start, time)
-        return {"position": (start + time * velocity) % LENGTH, "velocity": velocity,
-                "density": 1 + 0.01 * velocity[:, 0], "acceleration": self.acceleration(start, time)}
-
-
 def write_rollout(comm, directory, status="complete", total=600, frames=9, broken=None, injection_rate=0.0,
                   truth_injection_rate=0.0, density=True):
     """Write rollout.h5. The tracers of the truth end three frames earlier. Velocities of frame `broken` are NaN."""
@@ -196,7 +176,7 @@ def write_rollout(comm, directory, status="complete", total=600, frames=9, broke
                   "truth_injection_rate": truth_injection_rate}
     origin = provenance("ground_truth", "kernel", "model")
     with create_product(comm, directory / "rollout.h5", "rollout", origin) as file:
-        write_attributes(file.create_group("rollout"), attributes)
+        file.create_group("rollout").attrs.update(attributes)
         write_table(file, "outside_training", {"time": times, "share": 1e-3 * times * (0.9 - times)})
         late = times > 0
         write_table(file, "closure", {"time": times, "solves": 4.0 * late, "iterations": np.where(late, 10.0, 40.0),
@@ -204,7 +184,7 @@ def write_rollout(comm, directory, status="complete", total=600, frames=9, broke
                                       "residual": np.full(len(times), 1e-3), "not_converged": 1.0 * ~late})
         writer = TrajectoryWriter(file, "model", total, LENGTH, shapes, np.float32, images=True)
         for step, time in enumerate(times):
-            columns = PerturbedFlow(0.4).particles(places(total), time)
+            columns = particles(total, time, growth=0.4)
             if step == broken:
                 columns["velocity"] = np.full((total, 3), np.nan)
             writer.append(step, time, 0, columns)
