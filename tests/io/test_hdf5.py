@@ -10,7 +10,7 @@ import pytest
 from eddies.io.errors import WriteError
 from eddies.io.fields import FieldWriter
 from eddies.io.hdf5 import (CHUNK_BYTES, ProductError, append_frame, create_product, growing_dataset, in_files,
-                            open_product, read_attributes, read_table, stored_numbers, write_attributes, write_table)
+                            open_product, read_attributes, read_table, stored_numbers, write_table)
 from eddies.io.provenance import product_fingerprint, product_provenance, read_provenance
 from eddies.io.trajectories import TrajectoryWriter
 from eddies.parallel.stop import Stopped
@@ -20,7 +20,7 @@ from tests.changed_product import changed
 def write(comm, path, kind="kernel"):
     with create_product(comm, path, kind, {"scene": "[flow]", "fingerprint": "abc"}) as file:
         write_table(file, "statistics", {"time": np.arange(3.0), "nothing": np.zeros((0, 2))})
-        write_attributes(file.create_group("reference"), {"length": 0.5, "name": "x"})
+        file.create_group("reference").attrs.update({"length": 0.5, "name": "x"})
     return path
 
 
@@ -58,7 +58,7 @@ def test_unfinished_product_is_refused(comm, tmp_path):
     unfinished = tmp_path / "unfinished.h5"
     if comm.rank == 0:
         with h5py.File(unfinished, "w") as file:
-            write_attributes(file, {"kind": "model", "complete": False, "provenance": "{}"})
+            file.attrs.update({"kind": "model", "complete": False, "provenance": "{}"})
     comm.Barrier()
     with pytest.raises(ProductError, match="unfinished.h5: unfinished, .* run `eddies train SCENE`"):
         with open_product(comm, unfinished, "model"):
@@ -153,7 +153,7 @@ def test_all_ranks_raise_if_rank_0_cannot_write(comm, tmp_path, monkeypatch):
 def test_all_numbers_are_listed_and_of_series_the_last_frame(comm, tmp_path):
     with create_product(comm, tmp_path / "a.h5", "rollout", {}) as file:
         write_table(file, "errors", {"delay": np.arange(3.0), "count": np.arange(3), "single": 0.5})
-        write_attributes(file.create_group("rollout"), {"status": "complete", "turnovers": 1.5, "ranks": 2})
+        file.create_group("rollout").attrs.update({"status": "complete", "turnovers": 1.5, "ranks": 2})
         trajectory = TrajectoryWriter(file, "model", 4, 1.0, {"velocity": (3,)}, np.float64)
         fields = FieldWriter(file, "model", 2, {"velocity": 3})
         TrajectoryWriter(file, "none", 4, 1.0, {"velocity": (3,)}, np.float64)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from eddies.analysis.pareto import break_even
-from eddies.io.hdf5 import create_product, write_attributes, write_table
+from eddies.io.hdf5 import create_product, write_table
 from eddies.io.weights import save_weights
 from eddies.measures import MEASURES
 from eddies.scene.scene import load_scene
@@ -93,8 +93,8 @@ def test_the_cost_of_a_model_is_read_from_its_file(comm, tmp_path, stored):
     description = {"training": phases} if "training_seconds" in stored else {}
     save_weights(comm, tmp_path / "model.h5", "model", description, {"a": np.ones(3), "b": np.ones((2, 2))}, {})
     with create_product(comm, tmp_path / "step.h5", "step", {}) as file:
-        write_attributes(file.create_group("found"), {"integrator": "rk2", "size": 0.1, "seconds": 7.5, "error": 0.3,
-                                                      "error_with_half": 0.2})
+        file.create_group("found").attrs.update({"integrator": "rk2", "size": 0.1, "seconds": 7.5, "error": 0.3,
+                                                 "error_with_half": 0.2})
         write_table(file, "trials/rk2", {"size": [0.4, 0.2, 0.1, 0.05], "error": [0.6, 0.5, 0.3, 0.2]})
     known = {"weights": 7, "training_seconds": 2.0, "training_steps": 6}
     search = dict(zip(SEARCH, ("rk2", 0.1, 7.5, 0.3, 0.2, 0.5)))

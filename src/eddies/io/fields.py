@@ -6,7 +6,7 @@ from functools import cached_property
 import h5py
 import numpy as np
 
-from eddies.io.hdf5 import append_frame, find_group, growing_dataset, read_frame, read_times, unfit, write_attributes
+from eddies.io.hdf5 import append_frame, find_group, growing_dataset, read_frame, read_times, unfit
 
 
 class FieldWriter:
@@ -22,7 +22,7 @@ class FieldWriter:
 
     def __init__(self, file: h5py.File, name: str, cells: int, variables: Mapping[str, int]) -> None:
         group = file.create_group(f"fields/{name}")
-        write_attributes(group, {"cells": cells})
+        group.attrs["cells"] = cells
         self._time = growing_dataset(group, "time", (), np.float64)
         self._variables = {variable: growing_dataset(group, variable, (components, *[cells] * 3), np.float32)
                            for variable, components in variables.items()}

@@ -57,8 +57,8 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
             **environment(comm.size), **provenance, **identity(path.parent, provenance.get("made_from", ())),
             **{key: value for key, value in provenance.items() if key == "id"}}))
         with writing(file, len(origin) + HEADER_BYTES):
-            write_attributes(file, {"kind": kind, "format": FORMAT, "complete": False, "provenance": origin,
-                                    ATTRIBUTE: WORDS, **conventions(kind)})
+            file.attrs.update({"kind": kind, "format": FORMAT, "complete": False, "provenance": origin,
+                               ATTRIBUTE: WORDS, **conventions(kind)})
         yield file
         with writing(file, HEADER_BYTES):
             file.attrs["complete"] = True
@@ -73,12 +73,6 @@ def open_product(comm: MPI.Comm, path: str | Path, kind: str | None) -> Iterator
     """
     with on_all_ranks(comm, lambda: _open_checked(Path(path), kind), ProductError) as file:
         yield file
-
-
-def write_attributes(group: h5py.Group, values: Mapping[str, Any]) -> None:
-    """Write numbers, strings and short lists of numbers as attributes; the same on every rank."""
-    for name, value in values.items():
-        group.attrs[name] = value
 
 
 def read_attributes(file: h5py.Group, name: str) -> dict[str, Any]:

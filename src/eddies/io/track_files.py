@@ -26,7 +26,6 @@ import h5py
 import numpy as np
 
 from eddies.io.errors import ProductError, file_errors
-from eddies.io.hdf5 import write_attributes
 from eddies.io.new_files import create_export
 from eddies.io.trajectories import ROUNDING, write_h5md_header
 
@@ -134,7 +133,7 @@ def write_tracks(path: str | Path, times: Any, ids: Any, positions: Any, velocit
     with create_export(path, layout, {}) as file:
         write_h5md_header(file)
         holder = file["particles/tracks"]
-        write_attributes(holder.create_group("box"), {"dimension": 3, "boundary": np.array([b"periodic"] * 3)})
+        holder.create_group("box").attrs.update({"dimension": 3, "boundary": np.array([b"periodic"] * 3)})
         holder["box/edges"] = np.full(3, tracks.edge)
         for name, given in values.items():
             if given is not None:

@@ -15,7 +15,6 @@ import h5py
 import numpy as np
 
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import write_attributes
 from eddies.io.new_files import Layout, create_export
 from eddies.io.trajectories import Trajectory
 
@@ -39,8 +38,8 @@ def write_images(path: Path, series: FieldSeries, length: float, corner: np.ndar
         shape = (*[cells + 1] * 3, *components)
         layout[f"PointData/{variable}"] = shape if frames == 1 else (frames, *shape), sample.dtype
     with _create(path, "ImageData", frames, layout, provenance) as root:
-        write_attributes(root, {"WholeExtent": np.array([0, cells] * 3), "Origin": corner,
-                                "Spacing": np.full(3, length / cells), "Direction": np.eye(3).ravel()})
+        root.attrs.update({"WholeExtent": np.array([0, cells] * 3), "Origin": corner,
+                           "Spacing": np.full(3, length / cells), "Direction": np.eye(3).ravel()})
         _write_steps(root, series.times, {_offsets_of(name): np.arange(frames) for name in layout})
         for variable in series.variables:
             for frame in range(frames):
@@ -80,7 +79,7 @@ def _create(path: Path, kind: str, frames: int, layout: Layout,
     with create_export(path, within, provenance, STEP_BYTES * frames) as file:
         root = file["VTKHDF"]
         # The reader needs the type as a string of fixed length.
-        write_attributes(root, {"Version": np.array(VERSION), "Type": np.bytes_(kind)})
+        root.attrs.update({"Version": np.array(VERSION), "Type": np.bytes_(kind)})
         yield root
 
 
@@ -90,7 +89,7 @@ def _write_steps(root: h5py.Group, times: np.ndarray, offsets: Mapping[str, np.n
         root["FieldData/time"] = times
         return
     steps = root.create_group("Steps")
-    write_attributes(steps, {"NSteps": len(times)})
+    steps.attrs["NSteps"] = len(times)
     for name, values in {"Values": times, **offsets}.items():
         steps[name] = values
 

@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from eddies.io.hdf5 import create_product, write_attributes, write_table
+from eddies.io.hdf5 import create_product, write_table
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import IdOrder
 from eddies.parallel.stop import StopRequest
@@ -230,7 +230,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     seconds = time.perf_counter() - began
     provenance = stage_provenance(scene, "find-step")
     with create_product(comm, directory / STAGES["find-step"].file, "step", provenance) as file:
-        write_attributes(file.create_group("found"), {
+        file.create_group("found").attrs.update({
             "integrator": found.step.integrator, "size": found.step.size, "seconds_per_turnover": found.seconds,
             "error": found.error, "error_with_half": half.error, "difference": difference,
             "tolerance": half.tolerance, "seconds": seconds, "confirmed_on": len(truths) - 1,

@@ -11,7 +11,7 @@ import torch
 from eddies.clock import pace_in_words
 from eddies.io.frame_segments import FrameSegments
 from eddies.io.checkpoint import Guard
-from eddies.io.hdf5 import create_product, write_attributes, write_table
+from eddies.io.hdf5 import create_product, write_table
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
@@ -56,7 +56,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             with create_product(comm, directory / STAGES["simulate"].file, "rollout",
                                 stage_provenance(scene, "simulate")) as file:
                 segments.assemble(file)
-                write_attributes(file.create_group("rollout"), {
+                file.create_group("rollout").attrs.update({
                     **outcome, **method.description(), "method": settings.method,
                     "turnovers": outcome["time"] / turnover,
                     "injection_rate": forcing.injection_rate if forcing else 0.0,
