@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from eddies.kernels.splines import MisplacedPoint, PaddedPlanes, Splines
+from eddies.kernels.splines import MisplacedPoint, Splines
 
 SPACING, BELOW, ABOVE = 0.3, 3, 4
 # Degree, components, cells: fewer cells than splines are wide, one chunk of lines, and many of them.
@@ -18,9 +18,9 @@ CLOUDS = {
 }
 
 
-def padded_planes(cells):
-    """The planes of a slab that is the whole box."""
-    return PaddedPlanes(cells, SPACING, -BELOW, BELOW + cells + ABOVE)
+def whole(cells):
+    """The grid and the planes of a slab that is the whole box, as `Splines` takes them."""
+    return cells, SPACING, range(-BELOW, cells + ABOVE)
 
 
 def parts(cells, components=3, kind=np.float64):
@@ -46,7 +46,7 @@ def test_values_their_transpose_and_slopes(library, close, kind, degree, compone
     """The spread values and the planes have the same product as the values at the points. Slopes are differences."""
     random = np.random.default_rng(2)
     positions = SPACING * CLOUDS[kind](random, cells)
-    splines = Splines(degree, positions, padded_planes(cells))
+    splines = Splines(degree, positions, *whole(cells))
     for precision, error in ((np.float64, 1e-12), (np.float32, 1e-6)):
         planes, factors = parts(cells, components, precision), random.standard_normal((len(positions), components))
         values = splines.at(planes)
@@ -66,11 +66,11 @@ def test_values_their_transpose_and_slopes(library, close, kind, degree, compone
 def test_arrays_of_any_layout(library):
     """The copy of positions that are not contiguous must live until the call has ended."""
     positions = np.random.default_rng(2).uniform(0, 5, (1000, 3)).astype(np.float32)
-    expected = Splines(3, positions.astype(float), padded_planes(18)).at(parts(18))
+    expected = Splines(3, positions.astype(float), *whole(18)).at(parts(18))
     turned = [np.asfortranarray(part) for part in parts(18)]
     for other in (positions, np.asfortranarray(positions, float)):
         for _ in range(10):
-            splines = Splines(3, other, padded_planes(18))
+            splines = Splines(3, other, *whole(18))
             assert np.array_equal(splines.at(parts(18)), expected)
     assert np.array_equal(splines.at(turned), expected)
 
@@ -80,14 +80,14 @@ def test_the_first_position_without_a_cell_is_named(library, wrong):
     positions = np.ones((5000, 3))
     positions[[3777, 4999], [0, 2]] = wrong
     with pytest.raises(MisplacedPoint) as raised:
-        Splines(3, positions, padded_planes(11))
+        Splines(3, positions, *whole(11))
     assert raised.value.number == 3777
 
 
 def test_a_position_too_far_from_the_planes_is_refused(library):
-    padded = PaddedPlanes(20, 1.0, 8, 7)  # planes 8 ... 14: splines of points from 9 on, and below 13
+    planes = range(8, 15)  # splines of points from 9 on, and below 13
     for z in (9.0, 12.999, 32.9, -10.9):
-        Splines(3, np.array([[0.0, 0.0, z]]), padded)
+        Splines(3, np.array([[0.0, 0.0, z]]), 20, 1.0, planes)
     for z in (8.999, 13.0):
         with pytest.raises(MisplacedPoint):
-            Splines(3, np.array([[0.0, 0.0, z]]), padded)
+            Splines(3, np.array([[0.0, 0.0, z]]), 20, 1.0, planes)

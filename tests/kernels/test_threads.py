@@ -17,7 +17,7 @@ from eddies.kernels.splines import Splines
 from tests.kernels import test_flow as flow
 from tests.kernels import test_modes as modes
 from tests.kernels.test_copies import noise
-from tests.kernels.test_splines import padded_planes, parts
+from tests.kernels.test_splines import parts, whole
 
 CHECKOUT = Path(__file__).parents[2]
 PROGRAM = "import json\nfrom tests.kernels.test_threads import digests\nprint(json.dumps(digests()))"
@@ -78,7 +78,7 @@ def splines():
     random = np.random.default_rng(7)
     for degree, cells, kind in ((3, 41, "f8"), (5, 18, "f8"), (3, 11, "f8"), (3, 41, "f4"), (5, 41, "f4")):
         positions, values = random.uniform(0, 20, (30000, 3)), random.standard_normal((30000, 3))
-        compiled, planes = Splines(degree, positions, padded_planes(cells)), parts(cells, kind=kind)
+        compiled, planes = Splines(degree, positions, *whole(cells)), parts(cells, kind=kind)
         compiled.spread(values, planes)
         yield from (compiled.at(planes), compiled.slope(planes, values), *planes)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,17 +10,6 @@ from eddies.kernels.library import ADDRESS, INT, NUMBER, address, library, membe
 from eddies.kernels.neighbors import Box
 
 FITS = {1: "fit_linear", 2: "fit_quadratic"}
-
-
-@dataclass(frozen=True)
-class GridPlanes:
-    """Planes `first`, ..., `first + planes - 1` of a grid: `cells`^2 points a plane, `spacing` from point to point."""
-
-    cells: int
-    spacing: float
-    first: int
-    planes: int
-    periodic_z: bool
 
 
 class _Reconstruction(ctypes.Structure):
@@ -46,17 +34,18 @@ def kernel_numbers(support: float, pieces: np.ndarray, signed: bool = False) -> 
     return support, -np.inf if signed else 0.0, *map(float, pieces.shape), *map(float, pieces.ravel())
 
 
-def sums_on_grid(grid: GridPlanes, numbers: tuple[float, ...], position: np.ndarray,
+def sums_on_grid(box: Box, cells: int, planes: range, numbers: tuple[float, ...], position: np.ndarray,
                  columns: np.ndarray) -> np.ndarray:
-    """Sums over particles x_j (n, 3) of c_j W(x - x_j), for columns c (n, 4), at points x of the planes: (points, 4).
+    """Sums over particles x_j (n, 3) of c_j W(x - x_j), for columns c (n, 4), at points x of a grid: (points, 4).
 
-    `numbers` are W as `kernel_numbers` returns it. The result has the precision of the columns.
+    The points are those of consecutive `planes` of a grid of `cells`^3 points. `numbers` are W as `kernel_numbers`
+    returns it. The result has the precision of the columns.
     """
     position, columns = np.ascontiguousarray(position, np.float64), np.ascontiguousarray(columns)
     if columns.shape != (len(position), 4):
         raise ValueError(f"columns {columns.shape} of {len(position)} particles: four are needed")
-    sums, kernel = np.empty((grid.planes * grid.cells**2, 4), columns.dtype), np.array(numbers)
-    given = _Reconstruction(len(position), grid.cells, grid.first, grid.planes, grid.periodic_z, grid.spacing,
+    sums, kernel = np.empty((len(planes) * cells**2, 4), columns.dtype), np.array(numbers)
+    given = _Reconstruction(len(position), cells, planes.start, len(planes), box.periodic_z, box.length / cells,
                             numbers[0], *map(address, (position, kernel, columns, sums)))
     getattr(library(), f"reconstruction_sums_{columns.dtype}")(ctypes.byref(given))
     return sums

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,20 +11,6 @@ from eddies.kernels.library import ADDRESS, INT, NUMBER, address, library, membe
 
 # Padding of `fraction` along each axis, since the library may read beyond the last point; the same in splines.cpp.
 PADDING = 8
-
-
-@dataclass(frozen=True)
-class PaddedPlanes:
-    """Consecutive planes of a periodic grid of `cells`^3 points that a rank holds: its own and ghost planes.
-
-    `planes` is their number, `lowest` the index of the lowest one. The methods of `Splines` take them as `parts`, three
-    arrays (components, planes, y, x): ghosts below, own planes, ghosts above.
-    """
-
-    cells: int
-    spacing: float
-    lowest: int
-    planes: int
 
 
 class MisplacedPoint(ValueError):
@@ -43,20 +28,22 @@ class _Cloud(ctypes.Structure):
 class Splines:
     """The (degree + 1)^3 tensor-product B-splines around each of n points, for interpolation of degree 3 or 5.
 
-    `positions` (n, 3) are periodic in x, y and z, but the splines must lie within the planes. The points are sorted
-    once, in the constructor. Raises MisplacedPoint.
+    `planes` are the indices of the consecutive planes that a rank holds of a periodic grid of `cells`^3 points: its own
+    and ghost planes. The methods take them as `parts`, three arrays (components, planes, y, x): ghosts below, own
+    planes, ghosts above. `positions` (n, 3) are periodic in x, y and z, but the splines must lie within the planes. The
+    points are sorted once, in the constructor. Raises MisplacedPoint.
     """
 
-    def __init__(self, degree: int, positions: np.ndarray, padded: PaddedPlanes) -> None:
-        self._padded, count = padded, len(positions)
+    def __init__(self, degree: int, positions: np.ndarray, cells: int, spacing: float, planes: range) -> None:
+        self._spacing, count = spacing, len(positions)
         positions = np.ascontiguousarray(positions, np.float64)  # a copy must live until the call has ended
         self._arrays = {"order": np.empty(count, np.int32), "first": np.empty((count, 3), np.int32),
                         "fraction": np.zeros((3, count + PADDING)),
-                        "starts": np.empty(library().splines_bins(padded.cells, padded.planes) + 1, np.int64)}
-        self._cloud = _Cloud(count, padded.cells, padded.planes, degree, *map(address, self._arrays.values()))
+                        "starts": np.empty(library().splines_bins(cells, len(planes)) + 1, np.int64)}
+        self._cloud = _Cloud(count, cells, len(planes), degree, *map(address, self._arrays.values()))
         library().splines_arrange.restype = INT
         misplaced = library().splines_arrange(ctypes.byref(self._cloud), ADDRESS(address(positions)),
-                                              NUMBER(padded.spacing), INT(padded.lowest))
+                                              NUMBER(spacing), INT(planes.start))
         if misplaced >= 0:
             raise MisplacedPoint(misplaced)
 
@@ -70,7 +57,7 @@ class Splines:
         """Spatial gradient (n, 3) of sum_c factors_c f_c, with interpolated fields f_c and fixed `factors` (n, c)."""
         gradients = np.empty((self._cloud.points, 3))
         self._call("splines_slope", _contiguous(parts), np.ascontiguousarray(factors, np.float64), gradients)
-        return gradients / self._padded.spacing
+        return gradients / self._spacing
 
     def spread(self, values: np.ndarray, parts: Sequence[np.ndarray]) -> None:
         """Add values (n, c) to planes by the transpose of `at`. Planes must be contiguous and of one precision."""
@@ -84,9 +71,9 @@ class Splines:
         rows = [part.ctypes.data + part.strides[0] * np.arange(len(part))[:, None]
                 + part.strides[1] * np.arange(part.shape[1]) for part in parts]
         planes = np.concatenate(rows, axis=1, dtype=np.uint64, casting="unsafe")
-        if planes.shape[1] != self._padded.planes or any(len(column) != self._cloud.points for column in columns):
+        if planes.shape[1] != self._cloud.planes or any(len(column) != self._cloud.points for column in columns):
             raise ValueError(f"{planes.shape[1]} planes, columns of {[len(column) for column in columns]}: "
-                             f"{self._padded.planes} planes and {self._cloud.points} points are needed")
+                             f"{self._cloud.planes} planes and {self._cloud.points} points are needed")
         arguments = [ADDRESS(address(array)) for array in (planes, *columns)]
         getattr(library(), f"{name}_{kind}")(ctypes.byref(self._cloud), INT(len(planes)), *arguments)
 

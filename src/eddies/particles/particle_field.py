@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from eddies.kernels.pairs import PairSpace
-from eddies.kernels.reconstruction import GridPlanes, fitted, sums_on_grid, kernel_numbers
+from eddies.kernels.reconstruction import fitted, kernel_numbers, sums_on_grid
 from eddies.parallel.halo import HaloExchange
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.exchanges import with_ghosts
@@ -110,8 +110,8 @@ class ParticleField:
         """Average velocity (m, 3) at all of this rank's grid points; cheaper than with its gradient. Collective."""
         slab, volume = self.decomposition, self.volumes(kernel)
         weighted = volume.unsqueeze(1) * torch.cat([torch.ones_like(volume).unsqueeze(1), self._velocity], dim=1)
-        planes = GridPlanes(slab.planes, slab.spacing, slab.start, slab.count, self._box.periodic_z)
-        sums = torch.from_numpy(sums_on_grid(planes, _for_library(kernel), self._position.numpy(), weighted.numpy()))
+        sums = torch.from_numpy(sums_on_grid(self._box, slab.planes, range(slab.start, slab.stop), _for_library(kernel),
+                                             self._position.numpy(), weighted.numpy()))
         return sums[:, 1:] * normalisation(kernel, sums[:, :1])
 
     @torch.no_grad()

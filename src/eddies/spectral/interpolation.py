@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from eddies.kernels.splines import MisplacedPoint, PaddedPlanes, Splines
+from eddies.kernels.splines import MisplacedPoint, Splines
 from eddies.parallel.halo import HaloError, PlaneHalo
 from eddies.spectral.spectral_grid import SpectralGrid
 
@@ -29,8 +29,7 @@ class SplineInterpolation:
         reach = (self.degree - 1) // 2
         slab = grid.decomposition
         self._halo = PlaneHalo(slab, reach + margin, reach + 1 + margin)
-        self._padded = PaddedPlanes(grid.cells, slab.spacing, slab.start - self._halo.below,
-                                    slab.count + self._halo.below + self._halo.above)
+        self._planes = range(slab.start - self._halo.below, slab.stop + self._halo.above)
         angle = 2 * np.pi / grid.cells
         transforms = [_spline_transform(self.degree, angle * axis) for axis in grid.index]
         #: factors that turn the modes of a field into those of its spline coefficients
@@ -55,7 +54,7 @@ class SplineInterpolation:
         if z is farther outside, and ValueError if a position is not finite.
         """
         try:
-            return Splines(self.degree, positions, self._padded)
+            return Splines(self.degree, positions, self.grid.cells, self.grid.decomposition.spacing, self._planes)
         except MisplacedPoint as error:
             position = np.asarray(positions)[error.number]
         if not np.isfinite(position).all():
