@@ -128,12 +128,15 @@ def check_time(time: Time, flow: Flow, forcing: Forcing | None, spin_up: SpinUp 
         yield "tracers.forced", "needs a section [forcing], which the scene lacks; add it, or remove the key"
 
 
-def check_tracers(tracers: Tracers, flow: Flow, initial: Initial) -> Problems:
-    """Yield a problem if the initial flow is at rest, or if fields are stored on a finer grid than that of the flow."""
+def check_tracers(tracers: Tracers, flow: Flow, initial: Initial, variants: Collection[str]) -> Problems:
+    """Yield problems of an initial flow at rest, of fields on a finer grid than the flow's, and of names of sets."""
     if initial.flow.sound:
         yield "initial.kind", ("starts from rest and has no turnover time, the unit of [tracers] turnovers; choose "
                                "another kind, or remove [tracers]")
     for name, each in (tracers.sets or {"": tracers}).items():
+        problem = name and (problem_of_name(name) or name in variants and "a variant has this name; choose another")
+        if problem:
+            yield "tracers", f"set {name}: {problem}"
         if each.cells > flow.cells:
             key = f"set {name}: field_cells " if name else ""
             default = "" if each.field_cells else f"is {each.cells} (from particles_per_side) and "
@@ -141,30 +144,22 @@ def check_tracers(tracers: Tracers, flow: Flow, initial: Initial) -> Problems:
                 f"{key}{default}must be at most [flow] cells = {flow.cells}; lower field_cells or raise cells")
 
 
-def check_filtered(tracers: Tracers, present: Collection[str]) -> Problems:
-    """Yield a problem if tracers follow the unfiltered velocity in a scene with a kernel, a model or a rollout."""
+def check_particles(tracers: Tracers, kernel: Kernel | None, model: Model | None, simulation: Simulation | None,
+                    present: Collection[str]) -> Problems:
+    """Yield a problem if tracers follow the unfiltered velocity in a scene with a kernel, a model or a rollout, or if a
+    radius of neighbours with its skin is at least half the edge of the cube."""
     made = [f"[{name}]" for name in ("kernel", "model", "training", "simulation") if name in present]
     if not tracers.filtered and made:
         yield "tracers.filtered", ("these particles follow the unfiltered velocity, but kernels, models and rollouts "
                                    "need the filtered one; set it to true, choose another set of tracers, or "
                                    f"remove {', '.join(made)}")
-
-
-def check_sets(tracers: Tracers, variants: Collection[str]) -> Problems:
-    """Yield a problem for each set of tracers whose name is no valid directory name or is the name of a variant."""
-    for name in tracers.sets:
-        problem = problem_of_name(name) or name in variants and "a variant has this name; choose another"
-        if problem:
-            yield "tracers", f"set {name}: {problem}"
-
-
-def check_reach(section: str, neighbors: float, tracers: Tracers, skin: float) -> Problems:
-    """Yield a problem if a radius with `neighbors` particles, times 1 + skin, is at least half the edge of the cube."""
-    reach = tracers.radius_of(neighbors) * (1 + skin)
-    if reach >= math.pi:  # a particle would interact with another one and its periodic image
-        yield f"{section}.neighbors", (
-            f"with {tracers.particles} particles radius and skin together are {reach:.3g}, but must be less than half "
-            f"the cube, {math.pi:.3g}; lower neighbors or raise [tracers] particles_per_side")
+    for name, section in (("kernel", kernel), ("model", model)):
+        neighbors = section.neighbors if section else None
+        reach = tracers.radius_of(neighbors or 0.0) * (1 + (simulation.skin if simulation else 0.0))
+        if reach >= math.pi:  # a particle would interact with another one and its periodic image
+            yield f"{name}.neighbors", (
+                f"with {tracers.particles} particles radius and skin together are {reach:.3g}, but must be less than "
+                f"half the cube, {math.pi:.3g}; lower neighbors or raise [tracers] particles_per_side")
 
 
 def check_needs(present: Collection[str], needs_model: bool, has_weights: bool) -> Problems:

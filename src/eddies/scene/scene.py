@@ -259,12 +259,9 @@ class Scene(Section):
         yield from checks.check_flow(flow, self.initial, self.forcing, model)
         yield from checks.check_time(self.time, flow, self.forcing, self.spin_up, tracers)
         if tracers is not None:
-            yield from checks.check_tracers(tracers, flow, self.initial)
-            yield from checks.check_sets(tracers, self.variant)
+            yield from checks.check_tracers(tracers, flow, self.initial, self.variant)
         if tracers is not None and not self.sets:
-            yield from checks.check_filtered(tracers, present)
-            for name, neighbors in (("kernel", kernel and kernel.neighbors), ("model", model and model.neighbors)):
-                yield from checks.check_reach(name, neighbors or 0.0, tracers, simulation.skin if simulation else 0.0)
+            yield from checks.check_particles(tracers, kernel, model, simulation, present)
         yield from checks.check_needs(present, self.needs_model, model is not None and model.path is not None)
         yield from checks.check_density(flow, model, simulation)
         if self.training is not None and not self.sets:
