@@ -14,14 +14,14 @@ SCALES = ReferenceScales(filter_width=2 * SPACING, spacing=SPACING, velocity=1.0
                          acceleration=1.0, density_rate=0.02, sound_speed=10.0, viscosity=0.01)
 
 
-def model_of(preset, support, neighbors, hidden, **settings):
+def model_of(preset, support, neighbors, hidden):
     """The model of a preset, of terms or of settings by term, in double precision, with networks of these widths."""
     listed = {"preset": preset} if isinstance(preset, str) else {"terms": tuple(preset)}
-    settings = {**(preset if isinstance(preset, dict) else {}), **settings}
-    bare = Model(**listed)
-    widths = {name: {"hidden": hidden} for name, declared in bare.settings.items() if hasattr(declared, "hidden")}
+    settings = preset if isinstance(preset, dict) else {}
+    widths = {name: {"hidden": hidden} for name, declared in Model(**listed).settings.items()
+              if hasattr(declared, "hidden")}
     wanted = Model(**listed, settings={name: {**widths.get(name, {}), **settings.get(name, {})}
-                                       for name in widths.keys() | settings.keys()})
+                                       for name in widths | settings})
     return build_model(wanted.settings, wanted.terms, FlowUnits(SCALES, support, neighbors, seed=2))
 
 

@@ -85,8 +85,8 @@ def frame_of(comm, model, wind=0.0):
     return TrainingFrame(dynamics, particles, torch.from_numpy(acceleration), rate)
 
 
-def trainer_of(comm, preset=OWN_DENSITY, weights=ALL, batch=300, **settings):
-    model = model_of(preset, SUPPORT, 45, (8, 8), **settings)
+def trainer_of(comm, preset=OWN_DENSITY, weights=ALL, batch=300):
+    model = model_of(preset, SUPPORT, 45, (8, 8))
     return ForceTrainer(model, [frame_of(comm, model)], WendlandC2(SUPPORT), weights, batch, seed=5)
 
 
