@@ -34,7 +34,7 @@ from eddies.workflows.foreseen.storage import in_units
 from eddies.workflows.learned.source import read_source
 from eddies.workflows.problems import Context, check_ground_truth, memory_of_node, problems
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
-from eddies.workflows.run_directory.work import FAILURE, SECONDS, Work, find_work, stage_seconds
+from eddies.workflows.run_directory.work import FAILURE, SECONDS, find_work, stage_seconds
 from eddies.workflows.variants import Step, steps
 
 log = logging.getLogger("eddies")
@@ -80,9 +80,14 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     refused, warnings = problems(scene, Context(comm, stages, directory, variants, memory_of_node(comm)))
     for problem in refused:
         raise SceneError(problem)
-    if take_over:
+
+    def refuse_to_lose() -> None:
         for step in planned:
-            checked_work(step, comm, overwrite)  # a command that is refused must not end another job
+            in_files(comm, step.directory, partial(
+                find_work, step.stages, step.scene, step.directory, step.links, overwrite))
+
+    if take_over:
+        refuse_to_lose()  # a command that is refused must not end another job
     else:
         refuse_if_held(comm, directory)
     made = {file for step in planned for file in step.files}
@@ -91,8 +96,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     if on_first_rank(comm, lambda: os.path.exists(directory / "STOP")):  # ends a chain of jobs that resubmit themselves
         raise SceneError(f"{directory / 'STOP'}: asks the job to stop before it begins; remove the file to continue")
     with working_in(comm, directory, stop, take_over):
-        for step in planned:
-            checked_work(step, comm, overwrite)
+        refuse_to_lose()
         prepare_directory(scene.to_toml(), comm, directory)
         for warning in warnings if comm.rank == 0 else ():
             log.warning(warning)
@@ -139,7 +143,7 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
     scene, directory = step.scene, step.directory
     if step.links:  # the other inputs were checked before the first step
         check_inputs(step, comm)
-    work = checked_work(step, comm, overwrite)
+    work = in_files(comm, directory, lambda: find_work(step.stages, scene, directory, step.links, overwrite))
     if has_single_writer(comm):
         log.info("rank 0 writes all files, each at most %s, because this h5py has no MPI", in_units(LARGEST_BYTES))
     if scene.foreign:
@@ -159,16 +163,6 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
             check_ground_truth(step.stages[number:], scene, comm, directory)
             checked = True
         run_stage(name, (scene, comm, directory, stop), comm, directory, stop, name in work.begun)
-
-
-def checked_work(step: Step, comm: Comm, overwrite: bool) -> Work:
-    """Return what the directory of a step holds. Raises WouldReplaceWork if the step would replace files there
-    and `overwrite` is false."""
-    work = in_files(comm, step.directory, lambda: find_work(
-        [*step.links, *step.stages], step.scene, step.directory, step.links))
-    if not overwrite:
-        work.refuse_to_lose()
-    return work
 
 
 @contextmanager

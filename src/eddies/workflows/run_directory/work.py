@@ -56,15 +56,17 @@ class Work:
                                    "another --output")
 
 
-def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Collection[str] = ()) -> Work:
-    """The work that stages of a scene find in a locked run directory; one rank calls it. `links` are the stages whose
+def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Collection[str] = (),
+              overwrite: bool = True) -> Work:
+    """The work that stages of a scene find in a run directory; one rank calls it. `links` are further stages, whose
     products are links to other directories.
 
-    Raises ProductError if the system refuses to read a product or a checkpoint, because the file may be sound.
+    Raises WouldReplaceWork if work would be replaced and `overwrite` is false, and ProductError if the system refuses
+    to read a product or a checkpoint, because the file may be sound.
     """
     done, begun, obsolete, lost, changes = set(), set(), set(), [], {}
     seconds = stage_seconds(directory)
-    for stage in [STAGES[name] for name in stages if STAGES[name].product is not None]:
+    for stage in [STAGES[name] for name in (*links, *stages) if STAGES[name].product is not None]:
         product, settings = directory / stage.file, stage_fingerprint(scene, stage.name)
         checkpoints = checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
         keys = DURATION_KEYS.get(stage.name)
@@ -104,7 +106,10 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
             cost = "" if seconds_so_far is None else f", took {duration(seconds_so_far)}"
             lost.append(f"{stage.checkpoints} (step {checkpoints[0][0]}{cost})")
             changes |= dict.fromkeys(changed_settings(stage, _scene_of(directory), scene.to_toml()))
-    return Work(directory, frozenset(done), frozenset(begun), frozenset(obsolete), tuple(lost), tuple(changes))
+    work = Work(directory, frozenset(done), frozenset(begun), frozenset(obsolete), tuple(lost), tuple(changes))
+    if not overwrite:
+        work.refuse_to_lose()
+    return work
 
 
 def _scene_of(directory: Path) -> str | None:
