@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import h5py
 import numpy as np
 
-from eddies.io.errors import ContentError, ProductError, file_errors, read_errors, remedy_for
+from eddies.io.errors import ContentError, ProductError, WriteError, file_errors, read_errors, remedy_for
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -104,17 +104,16 @@ def add_checksums(comm: MPI.Comm, path: Path) -> None:
     from eddies.parallel.broadcast import on_all_ranks, on_first_rank
     from eddies.parallel.reduction import global_sum
     comm.Barrier()  # all ranks have closed the file
-    with file_errors(path):
-        size = on_first_rank(comm, lambda: path.stat().st_size)
-        sums = np.zeros(_count_blocks(size), np.uint32)
+    size = on_first_rank(comm, lambda: path.stat().st_size)
+    sums = np.zeros(_count_blocks(size), np.uint32)
 
-        def read() -> None:
-            with _opened(path) as descriptor:
-                for first, part in _own_pieces(comm, size):
-                    own = _read_sums(descriptor, first, part, size)
-                    sums[first:first + len(own)] = own
+    def read() -> None:
+        with file_errors(path), _opened(path) as descriptor:
+            for first, part in _own_pieces(comm, size):
+                own = _read_sums(descriptor, first, part, size)
+                sums[first:first + len(own)] = own
 
-        on_all_ranks(comm, read)
+    on_all_ranks(comm, read, WriteError)
     table = global_sum(comm, sums).astype("<u4").tobytes() + FOOTER.pack(size, MARK)
 
     def append() -> None:

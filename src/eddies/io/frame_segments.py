@@ -42,23 +42,20 @@ class FrameLayout:
     dtype: type[np.floating]  # of the trajectories
     fields: Mapping[str, FieldLayout]  # by name
 
-    def writers(self, file: File, names: Mapping[str, str], images: bool = False
+    def writers(self, file: File, names: Mapping[str, str] | None = None, images: bool = False
                 ) -> tuple[dict[str, TrajectoryWriter], dict[str, FieldWriter]]:
         """Return a dict of writers of trajectories and one of writers of fields, by name of the series; collective.
 
-        `names` maps each series that gets a writer to its name in the file. `images` adds the column `image` to
-        trajectories with positions.
+        `names` maps each series that gets a writer to its name in the file. If it is None, all series get one, under
+        their own names. `images` adds the column `image` to trajectories with positions.
         """
+        if names is None:
+            names = {name: name for name in (*self.trajectories, *self.fields)}
         return ({name: TrajectoryWriter(file, names[name], series.total, self.length, series.columns, self.dtype,
                                         images and "position" in series.columns)
                  for name, series in self.trajectories.items() if name in names},
                 {name: FieldWriter(file, names[name], series.cells, series.variables)
                  for name, series in self.fields.items() if name in names})
-
-    @property
-    def names(self) -> dict[str, str]:
-        """All series, each mapped to its own name."""
-        return {name: name for name in (*self.trajectories, *self.fields)}
 
 
 class FrameSegments:
@@ -79,7 +76,7 @@ class FrameSegments:
         in_files(self.comm, self.directory, lambda: self.directory.mkdir(exist_ok=True))
         self._name = f"frames-{step:08d}.h5"
         file = self._file.enter_context(create_product(self.comm, self.directory / self._name, "frames", {}))
-        self.trajectories, self.fields = self.layout.writers(file, self.layout.names)
+        self.trajectories, self.fields = self.layout.writers(file)
 
     def close(self) -> None:
         """Close the open segment, if any."""
@@ -98,21 +95,20 @@ class FrameSegments:
         return frames[:count]
 
     def assemble(self, file: File, names: Mapping[str, str] | None = None) -> None:
-        """Copy the frames of all segments into a product, and add the column `image`. `names` maps each series that is
-        copied to its name in the product. If `names` is None, all series are copied under their own names."""
+        """Copy the frames of all segments into a product, and add the column `image`. `names` says which series, as in
+        `FrameLayout.writers`."""
         self.close()
-        trajectories, fields = self.layout.writers(file, self.layout.names if names is None else names, images=True)
-        slabs = {name: SlabDecomposition(self.comm, self.layout.length, series.cells)
-                 for name, series in self.layout.fields.items()}
-        starts = {name: id_block(self.comm, series.total)[0] for name, series in self.layout.trajectories.items()}
+        trajectories, fields = self.layout.writers(file, names, images=True)
         for name in self.names:
             with open_product(self.comm, self.directory / name, None) as segment:
                 for group, trajectory in trajectories.items():
                     frames = Trajectory(segment, group)
+                    start, _ = id_block(self.comm, frames.total)
                     for frame, (step, time) in enumerate(zip(frames.steps, frames.times)):
-                        trajectory.append(step, time, starts[group], self._values(frames, frame))
+                        trajectory.append(step, time, start, self._values(frames, frame))
                 for group, field in fields.items():
-                    series, slab = FieldSeries(segment, group), slabs[group]
+                    series = FieldSeries(segment, group)
+                    slab = SlabDecomposition(self.comm, self.layout.length, series.cells)
                     for index, time in enumerate(series.times):
                         field.append(time, slab.start, {variable: series.read(index, variable, slab.start, slab.stop)
                                                         for variable in series.variables})

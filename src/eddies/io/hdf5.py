@@ -5,6 +5,7 @@
 
 import json
 import math
+import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +18,7 @@ from mpi4py import MPI
 from eddies.io.checksums import ATTRIBUTE, WORDS, open_to_read
 from eddies.io.errors import ProductError, file_errors, read_errors, remedy_for
 from eddies.io.new_files import HEADER_BYTES, frame_bytes, new_file, own_part, writing
-from eddies.io.provenance import FORMAT, environment, has_this_format, identity, read_json, read_provenance
+from eddies.io.provenance import FORMAT, environment, has_this_format, product_ids, read_json, read_provenance
 from eddies.io.quantities import conventions, describe, python_value
 from eddies.parallel.broadcast import on_all_ranks, on_first_rank
 from eddies.pipeline import MAKER_OF
@@ -54,8 +55,8 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
     path = Path(path)
     with new_file(comm, path) as file:
         origin = on_first_rank(comm, lambda: json.dumps({
-            **environment(comm.size), **provenance, **identity(path.parent, provenance.get("made_from", ())),
-            **{key: value for key, value in provenance.items() if key == "id"}}))
+            **environment(comm.size), "id": uuid.uuid4().hex, **provenance,
+            "made_from": product_ids(path.parent, provenance.get("made_from", ()))}))
         with writing(file, len(origin) + HEADER_BYTES):
             file.attrs.update({"kind": kind, "format": FORMAT, "complete": False, "provenance": origin,
                                ATTRIBUTE: WORDS, **conventions(kind)})

@@ -4,7 +4,6 @@ import datetime
 import functools
 import json
 import platform
-import uuid
 from collections.abc import Callable, Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
@@ -62,11 +61,11 @@ def commit() -> str | None:
     return next((line.split()[0] for line in packed if line.endswith(f" {reference}")), None)
 
 
-def identity(directory: Path, kinds: Iterable[str]) -> dict[str, Any]:
-    """A dict with a new `id`, and with `made_from`, which maps each of the `kinds` to the id of that product in a
-    directory. A missing or unreadable product is left out; a product without an id gives None."""
+def product_ids(directory: Path, kinds: Iterable[str]) -> dict[str, str | None]:
+    """The ids of the products of these kinds in a directory, by kind. A missing or unreadable product is left out; a
+    product without an id gives None."""
     beside = {kind: product_provenance(directory / MAKER_OF[kind].file) for kind in kinds}
-    return {"id": uuid.uuid4().hex, "made_from": {kind: origin.get("id") for kind, origin in beside.items() if origin}}
+    return {kind: origin.get("id") for kind, origin in beside.items() if origin}
 
 
 def product_provenance(path: str | Path) -> dict[str, Any]:

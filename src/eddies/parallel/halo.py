@@ -120,8 +120,9 @@ def require_thick_slabs(decomposition: SlabDecomposition, width: float) -> None:
 
 
 def _require_planes(slab: SlabDecomposition, needed: int, purpose: str) -> None:
-    if slab.thinnest() < needed:
-        raise HaloError(f"{slab.size} ranks make slabs of {slab.thinnest()} planes, thinner than the halo of {needed} "
+    thinnest = slab.planes // slab.size  # see `block_starts`
+    if thinnest < needed:
+        raise HaloError(f"{slab.size} ranks make slabs of {thinnest} planes, thinner than the halo of {needed} "
                         f"planes ({purpose}); use at most {max(slab.planes // needed, 1)} ranks")
 
 

@@ -37,7 +37,3 @@ class SlabDecomposition:
         plane = np.floor(np.asarray(z) / self.spacing).astype(np.int64)
         # z just below `length` may round up to a plane that does not exist.
         return self._owner[np.clip(plane, 0, self.planes - 1)]
-
-    def thinnest(self) -> int:
-        """Return the number of planes of the thinnest slab."""
-        return int(np.diff(self.starts).min())
