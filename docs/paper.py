@@ -21,7 +21,7 @@ from PIL import Image
 
 from eddies import open_run
 from eddies.analysis.against_truth import EDGES, conditional_flows, last_invariants, pdf_divergence
-from eddies.analysis.pdfs import bin_edges, bin_probabilities, gaussian, kl_divergence, pdf, standardized
+from eddies.analysis.pdfs import bin_centres, bin_edges, bin_probabilities, gaussian, kl_divergence, pdf, standardized
 from eddies.analysis.rollout import Rollout
 from eddies.flow.statistics import energy_spectrum
 from eddies.parallel.slab import SlabDecomposition
@@ -120,7 +120,7 @@ def figure_6(rollouts: dict[str, Rollout]):
     figure, axes = panels(2, 3, (3.5, 2.7), foot=0.3, sharex="row", sharey="row")
     first = next(iter(rollouts.values()))
     for row, (quantity, edges) in zip(axes, EDGES.items()):
-        centres = (edges[1:] + edges[:-1]) / 2
+        centres = bin_centres(edges)
         for axis, index in zip(row, first.common.spread(4)[1:]):
             truth = first.pair(index, quantity).truth
             lines = [("true tracers", {"color": TRUTH, "linewidth": 2.4}, truth)]

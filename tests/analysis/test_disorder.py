@@ -9,6 +9,7 @@ from eddies.analysis.disorder import (
     random_distance_density,
 )
 from eddies.analysis.lagrangian import minimum_image
+from eddies.analysis.pdfs import bin_centres
 
 LENGTH = 2 * np.pi
 
@@ -49,8 +50,7 @@ def test_random_points_have_the_distribution_of_hertz():
     shares = distance_probabilities(random_points(10_000), LENGTH)
     exact = -np.diff(np.exp(-4 / 3 * np.pi * edges**3))
     assert np.all(np.abs(shares - exact) < 3 * np.sqrt(2 * exact / 10_000) + 3e-4)
-    centres = (edges[1:] + edges[:-1]) / 2
-    assert random_distance_density(centres) * np.diff(edges) == pytest.approx(exact, abs=2e-3)
+    assert random_distance_density(bin_centres(edges)) * np.diff(edges) == pytest.approx(exact, abs=2e-3)
 
 
 def test_counts_of_lattices_random_points_and_clusters():

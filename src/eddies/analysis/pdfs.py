@@ -12,6 +12,11 @@ def bin_edges(half_width: float, bins: int) -> np.ndarray:
     return np.linspace(-half_width, half_width, bins + 1)
 
 
+def bin_centres(edges: np.ndarray) -> np.ndarray:
+    """Middle of each bin (bins,)."""
+    return (edges[1:] + edges[:-1]) / 2
+
+
 def bin_probabilities(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Fraction of the values, of any shape, in each bin (bins,); values beyond the ends count in the end bins.
 

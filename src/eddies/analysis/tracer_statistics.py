@@ -21,13 +21,12 @@ EDGES = bin_edges(12, 120)  # bins of the PDF of accelerations, in standard devi
 
 @dataclass(frozen=True)
 class Dispersion:
-    """Means over the tracer pairs with the initial distance `distance`; `pairs` is their number.
+    """Means over the tracer pairs with the initial distance `distance`.
 
     `spread` is <|r(t) - r(0)|^2>, (frames,). `structure` is <|v_1 - v_2|^2> at the start.
     """
 
     distance: float
-    pairs: int
     spread: np.ndarray
     structure: float
 
@@ -133,6 +132,6 @@ def _dispersion(tracers: Frames, spacing: float) -> list[Dispersion]:
         return []
     frames = (tracers.read(frame, "position") for frame in range(tracers.times.size))
     spreads = pair_dispersion(frames, list(groups.values()), tracers.length)
-    return [Dispersion(distance, pairs.shape[1], spread,
+    return [Dispersion(distance, spread,
                        float(np.mean(np.sum((velocity[pairs[0]] - velocity[pairs[1]]) ** 2, axis=1))))
             for (distance, pairs), spread in zip(groups.items(), spreads)]

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 from matplotlib.transforms import Bbox
 
-from eddies.analysis.pdfs import gaussian, pdf, standardized
+from eddies.analysis.pdfs import bin_centres, gaussian, pdf, standardized
 
 # The palette of Okabe and Ito, safe for colour-blind readers. A quantity has one colour in all figures.
 DNS, FILTERED, TRUTH, MODEL = "#000000", "#7f7f7f", "#0072B2", "#D55E00"
@@ -124,7 +124,7 @@ def largest(*arrays: np.ndarray) -> float:
 
 def draw_pdfs(axis: Axes, truth: np.ndarray, model: np.ndarray, edges: np.ndarray) -> None:
     """Draw the PDFs of true and modelled values, in units of the truth's standard deviation, and a Gaussian."""
-    centres = (edges[1:] + edges[:-1]) / 2
+    centres = bin_centres(edges)
     densities = (pdf(standardized(values, truth), edges) for values in (truth, model))
     true, modelled = (np.where(density > 0, density, np.nan) for density in densities)
     axis.semilogy(centres, gaussian(centres), color=GUIDE, linestyle=":", label="Gaussian")

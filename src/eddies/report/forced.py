@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from eddies.analysis.against_truth import EDGES, mean_energy
 from eddies.analysis.block_averages import Blocks, Estimate
 from eddies.analysis.isotropic_turbulence import StationarySpan
-from eddies.analysis.pdfs import bin_probabilities, gaussian, kl_divergence, pdf, standardized
+from eddies.analysis.pdfs import bin_centres, bin_probabilities, gaussian, kl_divergence, pdf, standardized
 from eddies.analysis.rollout import Frames, Rollout, second_half
 from eddies.analysis.spectra import spectrum_error
 from eddies.analysis.velocity_gradients import InvariantBins, Invariants
@@ -149,7 +149,7 @@ def forced_rollout(series: tuple[np.ndarray, np.ndarray], flow: tuple[float, flo
     spectrum.set(title="Mean spectrum", xlabel="$k$", ylabel="$E(k)$")
     number_wavenumbers(spectrum)
     edges = EDGES["acceleration"]
-    middle = (edges[1:] + edges[:-1]) / 2
+    middle = bin_centres(edges)
     for values, colour, label in zip(accelerations, (TRUTH, MODEL), ("true tracers at the start", "forced model")):
         found = pdf(values, edges)
         density.semilogy(middle[found > 0], found[found > 0], color=colour, label=label)

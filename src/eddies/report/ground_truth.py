@@ -42,7 +42,7 @@ METRICS = {
 
 
 def section(statistics: Table, spectra: Table, reference: Mapping[str, float], planes: Table,
-            field_name: str, source: str = "Direct numerical simulation.") -> Section:
+            field_name: str, source: str) -> Section:
     """Return the section from the tables `statistics` and `spectra` and the attributes `reference`.
 
     Numbers are those at the release of the tracers, or at the end if there are no tracers. planes: arrays [y, x] of the

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from eddies.analysis import disorder
 from eddies.analysis.against_truth import EDGES, InvariantStatistics, pdf_divergence
 from eddies.analysis.lagrangian import PathStatistics
+from eddies.analysis.pdfs import bin_centres
 from eddies.analysis.rollout import Pair, Plane, SpectraAt
 from eddies.analysis.velocity_gradients import ConditionalVelocity, vieillefosse_line
 from eddies.report.figures import (BAR, DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SIGNED, TRUTH, colour_bar,
@@ -211,7 +212,7 @@ def particle_disorder(distances: Mapping[str, np.ndarray], counts: Mapping[str, 
     """
     figure, axes = panels(1, 2, (4.0, 3.1))
     edges = disorder.DISTANCE_EDGES
-    fine, centres = np.linspace(edges[0], edges[-1], 300), (edges[1:] + edges[:-1]) / 2
+    fine, centres = np.linspace(edges[0], edges[-1], 300), bin_centres(edges)
     nearest, variance = axes[0]
     nearest.plot(fine, disorder.random_distance_density(fine), color=GUIDE, linestyle=":", label="random points")
     for name, line in LINES.items():
@@ -236,7 +237,7 @@ def invariant_plane(statistics: InvariantStatistics,
     names = "true tracers", "model"
     figure, axes = panels(1 if flows is None else 2, 2, (4.3, 3.2), right=BAR + 0.1, sharex=True, sharey=True)
     bins = statistics.bins
-    across, up = _centres(bins.third)[-2], _centres(bins.second)[-2]
+    across, up = bin_centres(bins.third)[-2], bin_centres(bins.second)[-2]
     densities = [bins.density(cells) for cells in (statistics.truth, statistics.model)]
     # Two to eight contour levels, half a decade apart, from the peak of the truth down to the density of one particle.
     peak, single = (np.log10(extreme) for extreme in (densities[0].max(), densities[0][densities[0] > 0].min()))
@@ -245,8 +246,8 @@ def invariant_plane(statistics: InvariantStatistics,
     for axis, density, name in zip(axes[0], densities, names):
         # Outer cells are not drawn, because they also count all values beyond them. Empty cells get a value above 0.
         shown = np.maximum(density[1:-1, 1:-1], 1e-3 * levels[0])
-        filled = axis.contourf(_centres(bins.third)[1:-1], _centres(bins.second)[1:-1], shown, levels, cmap="YlGnBu",
-                               norm=LogNorm(levels[0], levels[-1]), extend="max")
+        filled = axis.contourf(bin_centres(bins.third)[1:-1], bin_centres(bins.second)[1:-1], shown, levels,
+                               cmap="YlGnBu", norm=LogNorm(levels[0], levels[-1]), extend="max")
         axis.set_title(f"joint PDF, {name}")
     bar = colour_bar(figure, filled, axes[0], "joint PDF", extend="neither")
     bar.set_ticks(levels[::2], labels=[f"{level:.0e}" for level in levels[::2]])
@@ -275,7 +276,7 @@ def invariant_plane(statistics: InvariantStatistics,
 
 def _draw_arrows(axis: Axes, flow: ConditionalVelocity, norm: LogNorm | None, third_limit: float, second_limit: float):
     """Draw arrows of equal length where |R| < `third_limit` and |Q| < `second_limit`; no arrow leaves the panel."""
-    third, second = np.meshgrid(_centres(flow.bins.third), _centres(flow.bins.second))
+    third, second = np.meshgrid(bin_centres(flow.bins.third), bin_centres(flow.bins.second))
     inside = (np.abs(third) < third_limit) & (np.abs(second) < second_limit)
     second_rate, third_rate = (rate[inside] for rate in flow.mean(FEWEST))
     across, up = third_rate / np.ptp(flow.bins.third), second_rate / np.ptp(flow.bins.second)
@@ -283,7 +284,3 @@ def _draw_arrows(axis: Axes, flow: ConditionalVelocity, norm: LogNorm | None, th
     length[length == 0] = np.nan
     return axis.quiver(third[inside], second[inside], across / length, up / length, np.hypot(second_rate, third_rate),
                        norm=norm, cmap="cividis", pivot="middle", scale=20, width=0.006, headwidth=4)
-
-
-def _centres(edges: np.ndarray) -> np.ndarray:
-    return (edges[1:] + edges[:-1]) / 2

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from eddies.analysis.isotropic_turbulence import acceleration_constant
-from eddies.analysis.pdfs import gaussian
+from eddies.analysis.pdfs import bin_centres, gaussian
 from eddies.analysis.tracer_statistics import EDGES, TracerStatistics
 from eddies.report.figures import DNS, FOURTH, GUIDE, MODEL, SECOND, TRUTH, letter, number_wavenumbers, panels, styled
 from eddies.report.page import Metric, Section
@@ -73,7 +73,7 @@ def tracers(found: TracerStatistics, scales: Mapping[str, float]) -> Figure:
     figure, axes = panels(2, 2, (4.6, 2.9))
     energy, acceleration, memory, spreading = axes.flat
     _energy_panel(energy, found, scales["eddy_turnover_time"])
-    centres = (EDGES[1:] + EDGES[:-1]) / 2
+    centres = bin_centres(EDGES)
     seen = found.probability > 0
     acceleration.semilogy(centres[seen], found.probability[seen], color=TRUTH, label="tracers")
     acceleration.semilogy(centres, gaussian(centres), color=GUIDE, linestyle="--", label="Gaussian")

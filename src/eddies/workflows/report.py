@@ -51,8 +51,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("eddies")
 
-#: Products, in the order in which they are read.
-KINDS = "ground_truth", "kernel", "reconstruction", "model", "step", "rollout"
 ROLLOUT_COST = {"seconds_per_step": "rollout: seconds of a step (median, without storing)",
                 "particles": "particles of the rollout",
                 "ranks": "ranks of the rollout"}
@@ -69,13 +67,13 @@ class Page:
     """A page of the report, made by one rank.
 
     directory: run directory of the products. seconds: wall seconds by stage. provenance: provenance by kind of product.
-    not_finite: by kind, a sentence on each product with numbers that are not finite. images: PNG figures by name.
+    not_finite: a sentence on each product with numbers that are not finite. images: PNG figures by name.
     """
 
     directory: Path
     seconds: dict[str, float]
     provenance: dict[str, dict[str, Any]] = field(default_factory=dict)
-    not_finite: dict[str, str] = field(default_factory=dict)
+    not_finite: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     cost: list[Metric] = field(default_factory=list)
     stationary: StationarySpan | None = None
@@ -270,7 +268,7 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
         "step": lambda file: [steps.section(read_attributes(file, "found"), {
             name: read_table(file, f"trials/{name}") for name in file["trials"]})],
         "rollout": lambda file: _rollout_sections(measured.rollout, page, main)}
-    for kind in KINDS:
+    for kind in MAKER_OF:
         path = directory / f"{kind}.h5"
         if not path.exists():
             continue
@@ -279,7 +277,7 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
             if path.resolve() not in scanned:
                 scanned[path.resolve()] = not_finite(file, kind)
             if found := scanned[path.resolve()]:
-                page.not_finite[kind] = found
+                page.not_finite.append(found)
             page.cost += _cost(file, kind)
             if kind == "ground_truth" and "stationary" in file:
                 with contextlib.suppress(ProductError):  # the section on stationary turbulence shows the error
@@ -287,10 +285,10 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
             if main or not path.is_symlink():
                 page.sections += _sections_or_notice(kind, page, lambda: readers[kind](file))
     if not page.provenance:
-        raise ProductError(f"{directory}: holds none of {', '.join(f'{kind}.h5' for kind in KINDS)}; "
+        raise ProductError(f"{directory}: holds none of {', '.join(f'{kind}.h5' for kind in MAKER_OF)}; "
                            "run `eddies dns SCENE` first")
     page.warnings = [*mixed_products(page.provenance), *changed_truths(page.provenance.get("model", {})),
-                     *page.not_finite.values()]
+                     *page.not_finite]
     page.sections = verdict.arranged([*page.sections, _cost_section(page)], bool(page.warnings))
     return page
 
@@ -303,7 +301,7 @@ def _sections_or_notice(kind: str, page: Page, read: Callable[[], list[Section]]
         if not page.not_finite:
             raise
         title = kind.replace("_", " ").capitalize()
-        return [Section(kind, title, notices=[f"Not shown ({error}): {'; '.join(page.not_finite.values())}"])]
+        return [Section(kind, title, notices=[f"Not shown ({error}): {'; '.join(page.not_finite)}"])]
 
 
 def read_stationary_span(file: File) -> StationarySpan:
@@ -332,11 +330,9 @@ def _ground_truth_sections(file: File) -> list[Section]:
         spectra["energy"] = spectra["energy"][-1:]
     if not np.any(spectra["energy"]):
         return [Section("ground_truth", "Ground truth", notices=["The flow is at rest: its velocity is zero."])]
-    source = {}
-    if "tracks" in file:
-        about = read_attributes(file, "tracks")
-        source = {"source": SOURCE_OF_TRACKS.format(**about)}
-    sections = [ground_truth.section(statistics, spectra, reference, planes, name, **source)]
+    measured = "tracks" in file
+    source = SOURCE_OF_TRACKS.format(**read_attributes(file, "tracks")) if measured else "Direct numerical simulation."
+    sections = [ground_truth.section(statistics, spectra, reference, planes, name, source)]
     if "stationary" in file:
         try:
             sections.append(stationary.section(statistics, read_stationary_span(file)))
@@ -347,8 +343,8 @@ def _ground_truth_sections(file: File) -> list[Section]:
         found = tracer_statistics(Trajectory(file, "tracers"), spectra, reference["spacing"])
         scene = tomllib.loads(read_provenance(file)["scene"])
         filtered = scene.get("tracks", scene.get("tracers", {})).get("filtered", True)
-        filtered |= "tracks" in file and bool(file["tracks"].attrs.get("traced", False))
-        sections.append(tracers.section(found, reference, None if source else power, filtered))
+        filtered |= measured and bool(file["tracks"].attrs.get("traced", False))
+        sections.append(tracers.section(found, reference, None if measured else power, filtered))
     return sections
 
 
