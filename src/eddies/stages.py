@@ -31,7 +31,7 @@ from eddies.parallel.stop import Stopped, StopRequest
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.foreseen.storage import in_units
-from eddies.workflows.learned.source import read_source
+from eddies.workflows.learned.source import ModelDefinition, read_source
 from eddies.workflows.problems import Context, check_ground_truth, memory_of_node, problems
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 from eddies.workflows.run_directory.work import FAILURE, SECONDS, find_work, stage_seconds
@@ -200,7 +200,7 @@ def check_inputs(step: Step, comm: Comm, made: Collection[Path] = ()) -> None:
     stages, scene = step.stages, step.scene
     weights = scene.model.weights_file if "train" in stages and scene.model is not None else None
     if weights is not None and weights not in made:
-        read_source(scene, comm)
+        read_source(scene.name, ModelDefinition.of(scene), comm)
     for needed in scene.inputs(stages[0]):
         holder = step.links.get(needed.name, step.directory)
         if holder / needed.file in made:

@@ -29,6 +29,7 @@ from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
 from eddies.workflows.foreseen.storage import Storage, in_units, most_disk, storage
 from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.ground_truth.scene_flow import given_spectrum, stored_states
+from eddies.workflows.learned.source import ModelDefinition, read_source
 from eddies.workflows.variants import Step, steps
 
 LARGEST_MACH = 0.3           # turbulent Mach number; relative density fluctuations are about its square
@@ -85,13 +86,19 @@ def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
     doubts: dict[str, list[str]] = {}
     needs: list[Storage] = []
     for step in planned:
-        refused |= dict.fromkeys(f"{step.scene.name}: {problem}" for problem in _infeasible(step, comm, made))
-        refused |= dict.fromkeys(directory_problems(step.stages, comm, step.directory))
-        refused |= dict.fromkeys(_unfit_files(step, comm, made))
+        own, stages = step.scene, step.stages
+        refused |= dict.fromkeys(f"{own.name}: {problem}" for problem in _infeasible(step, comm, made))
+        refused |= dict.fromkeys(directory_problems(stages, comm, step.directory))
+        weights = own.model.weights_file if "train" in stages else None
+        given = weights is not None and weights not in made and on_first_rank(comm, weights.is_file)
+        refused |= dict.fromkeys(_unfit_files(
+            own.initial if "dns" in stages and own.tracks is None else None,
+            ModelDefinition.of(own) if given else None, own.name,
+            own.device if {"train", "simulate"} & {*stages} else "cpu", comm))
         for doubt in _warnings(step, made):
             doubts.setdefault(doubt, []).append(step.variant or "")
-        for stage in step.stages:
-            needs.append(storage(step.scene, stage, comm.size))
+        for stage in stages:
+            needs.append(storage(own, stage, comm.size))
             if on_node * needs[-1].memory > context.memory:
                 doubts[f"{stage}: {on_node} ranks with about {in_units(needs[-1].memory)} each need more than the "
                        f"{in_units(context.memory)} of memory here; take more nodes, or fewer cells or particles"] = []
@@ -112,9 +119,11 @@ def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
 
 
 def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
-    """Yield problems: an unstable or decayed flow, too many steps, frames, ranks or bytes, or too few frames."""
+    """Yield problems: an unstable or decayed flow, too many steps, frames, ranks or bytes, too few frames, or unfit
+    ground truths of other runs."""
     scene, stages, expected = step.scene, step.stages, estimate(step.scene)
-    tracers, turbulence, truth = scene.tracers, expected.turbulence, step.links.get("dns", step.directory)
+    tracers, turbulence, directory = scene.tracers, expected.turbulence, step.links.get("dns", step.directory)
+    truth = directory / STAGES["dns"].file
     if "dns" in stages:
         if scene.forcing is not None:
             yield from _strong_forcing(scene.initial, scene.forcing, scene.time)
@@ -129,13 +138,16 @@ def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]
     # No upper limit of the turnover time is known if the flow decays before the tracers start, or is hardly turbulent.
     decays = scene.spin_up is not None and scene.forcing is None
     if tracers is not None and turbulence is not None and turbulence.reynolds_lambda >= TURBULENT and (
-            not decays and truth / STAGES["dns"].file in made):
+            not decays and truth in made):
         yield from _too_few_frames(tracers, turbulence.turnover_time, partial(
-            check_frames, stages, tracers, scene.own_training, scene.simulation, scene.seen_in(truth)))
+            check_frames, stages, tracers, scene.own_training, scene.simulation, scene.seen_in(directory)))
     limits = most_ranks(scene.ground_truth_alone if set(stages) == {"dns"} else scene)
     yield from rank_problems(limits, comm.size)
     if has_single_writer(comm):
         yield from _large_files({stage: storage(scene, stage, comm.size) for stage in stages}, comm.size)
+    if "train" in stages and scene.model.path is None and scene.training.truths is not None:
+        from eddies.workflows.learned.truths import truth_problems  # imports torch
+        yield from truth_problems(scene.training, tracers, scene.model.reads, truth, comm)
 
 
 def _strong_forcing(initial: Initial, forcing: Forcing, time: Time) -> Iterator[str]:
@@ -218,30 +230,25 @@ def directory_problems(stages: Sequence[str], comm: Comm, directory: Path) -> li
         return [f"{directory}: cannot be used ({error.strerror}); choose another --output"]
 
 
-def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
-    """Problems of the files that stages read (initial flow, trained weights, other ground truths), or a missing GPU.
-    Weights that earlier steps make are not read."""
-    scene, stages, model = step.scene, step.stages, step.scene.model if "train" in step.stages else None
+def _unfit_files(initial: Initial | None, definition: ModelDefinition | None, name: str, device: str,
+                 comm: Comm) -> Iterator[str]:
+    """Yield a problem of the files with the initial flow and with trained weights, or a missing GPU.
+
+    `initial` is None if no flow starts, `definition` if no weights are read. `name` is that of the scene.
+    """
     try:
-        if "dns" in stages and scene.initial.flow.from_file and scene.tracks is None:
-            with stored_states(scene.initial, comm):
+        if initial is not None and initial.flow.from_file:
+            with stored_states(initial, comm):
                 pass
-        if "dns" in stages and scene.initial.kind == "spectrum":
-            given_spectrum(scene.initial, comm)
-        weights = model.weights_file if model is not None else None
-        if weights is not None and weights not in made and on_first_rank(comm, weights.is_file):
-            from eddies.workflows.learned.source import read_source
-            read_source(scene, comm)
-        if scene.device != "cpu" and {"train", "simulate"} & {*stages}:
+        if initial is not None and initial.kind == "spectrum":
+            given_spectrum(initial, comm)
+        if definition is not None:
+            read_source(name, definition, comm)
+        if device != "cpu":
             from eddies.particles.devices import prepare_torch  # imports torch
-            prepare_torch(scene.device, comm)
+            prepare_torch(device, comm)
     except UserError as error:
         yield str(error)
-    if model is not None and model.path is None and scene.training.truths is not None:
-        from eddies.workflows.learned.truths import truth_problems  # imports torch
-        own_file = step.links.get("dns", step.directory) / STAGES["dns"].file
-        for problem in truth_problems(scene.training, scene.tracers, model.reads, own_file, comm):
-            yield f"{scene.name}: {problem}"
 
 
 # ---- reasons to doubt a result

@@ -44,6 +44,10 @@ def described(*overrides):
     return json.loads(json.dumps(ModelDefinition.of(scene(*overrides)).describe(SCALES)))
 
 
+def read(scene, comm):
+    return read_source(scene.name, ModelDefinition.of(scene), comm)
+
+
 def write_source(comm, directory, description=None):
     comm.Barrier()
     save_weights(comm, directory / "model.h5", "model", description or described(), {"bias": np.arange(3.0)},
@@ -54,7 +58,7 @@ def write_source(comm, directory, description=None):
 def test_a_run_directory_or_its_file_gives_description_weights_and_tables(comm, tmp_path):
     write_source(comm, tmp_path)
     for path in (tmp_path, tmp_path / "model.h5"):
-        source = read_source(scene(f"model.path={path}"), comm)
+        source = read(scene(f"model.path={path}"), comm)
         assert source.path == tmp_path / "model.h5"
         assert source.description == described() and source.provenance["mach_turbulent"] == 0.08
         assert np.array_equal(source.weights["bias"], np.arange(3.0)) and set(source.tables) == {"a_priori"}
@@ -75,7 +79,7 @@ def test_a_model_of_another_form_is_refused_with_both_values(comm, tmp_path, own
     own("own_networks", "from torch import nn\nclass Net(nn.Module):\n    def forward(self, features): pass\n")
     write_source(comm, tmp_path)
     with pytest.raises(SceneError) as error:
-        read_source(scene(f"model.path={tmp_path}", f"{key}={here}"), comm)
+        read(scene(f"model.path={tmp_path}", f"{key}={here}"), comm)
     section, _, name = key.rpartition(".")
     for part in (f"[{section}] {name} = {here}", str(tmp_path / "model.h5"), there):
         assert part in str(error.value)
@@ -87,7 +91,7 @@ def test_other_terms_are_refused_with_both_lists(comm, tmp_path, terms):
     """Another order too, because it changes the rounding of sums."""
     write_source(comm, tmp_path)
     with pytest.raises(SceneError) as error:
-        read_source(scene_with(tmp_path, *terms), comm)
+        read(scene_with(tmp_path, *terms), comm)
     for part in (f"[model] terms = {quoted(terms)}", '["pressure", "stress", "viscosity", "damping", "relaxation", "p'):
         assert part in str(error.value)
 
@@ -109,7 +113,7 @@ def test_a_file_never_has_a_class_imported(comm, tmp_path, own):
     terms = {"pressure": {"force": True}, "own_source:Drag": {}}
     write_source(comm, tmp_path, {"terms": terms, "scales": SCALES.to_dict(), "neighbors": 56.0})
     with pytest.raises(SceneError, match=r'terms = \["pressure"\], .* \["pressure", "own_source:Drag"\]'):
-        read_source(scene_with(tmp_path, "pressure"), comm)
+        read(scene_with(tmp_path, "pressure"), comm)
     assert "own_source" not in sys.modules and not (tmp_path / "imported").exists()
     comm.Barrier()
     if comm.rank == 0:  # whose path leads to the module
@@ -124,7 +128,7 @@ def test_weights_of_the_first_version_are_read(comm, name, base):
     """Keys of terms that no longer exist have the values at which they are now fixed."""
     changes = ["model.preset=local"] if name == "hit-local" else []
     found = one_model(base, [*changes, f"model.path=eddies:{name}"])
-    source = read_source(found, comm)
+    source = read(found, comm)
     scales = ReferenceScales(**source.description["scales"])
     model = load_model(ModelDefinition.of(found), comm, source.path, scales)
     assert {key: value.shape for key, value in source.weights.items()} == {

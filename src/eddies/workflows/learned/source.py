@@ -79,19 +79,19 @@ class ModelDefinition:
             yield "[tracers] filter_width", f"{self.tracers.filter_width:.9g}", f"{width:.9g}"
 
 
-def read_source(scene: Scene, comm: Comm) -> StoredWeights:
-    """Read the trained model that [model] path names; all ranks call it.
+def read_source(name: str, definition: ModelDefinition, comm: Comm) -> StoredWeights:
+    """Read the trained model that [model] path of the scene `name` names; all ranks call it.
 
     Raises:
         ProductError: the file is missing or damaged.
         SceneError: the model has other terms, settings, neighbours or filter width in spacings than the scene.
     """
-    path = scene.model.weights_file
+    path = definition.model.weights_file
     try:
         source = load_weights(comm, path, "model")
     except ProductError as error:
-        raise ProductError(f"{scene.name}: [model] path = {quoted(scene.model.path)}: {error}") from None
-    for key, wanted, trained in ModelDefinition.of(scene).differences(source.description):
-        raise SceneError(f"{scene.name}: {key} = {wanted}, but {path} was trained with {trained}; set "
+        raise ProductError(f"{name}: [model] path = {quoted(definition.model.path)}: {error}") from None
+    for key, wanted, trained in definition.differences(source.description):
+        raise SceneError(f"{name}: {key} = {wanted}, but {path} was trained with {trained}; set "
                          f"{key} = {trained}, or give another [model] path")
     return source

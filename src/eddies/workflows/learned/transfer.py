@@ -32,7 +32,8 @@ def run(scene: Scene, comm: Comm, directory: Path) -> None:
     Tables are copied from the source, except the a-priori tests, which are repeated on this flow. The tests on the flow
     of the training are kept as `source_a_priori` if the source has them. The cost of training is copied too.
     """
-    source, definition = read_source(scene, comm), ModelDefinition.of(scene)
+    definition = ModelDefinition.of(scene)
+    source = read_source(scene.name, definition, comm)
     device = prepare_torch(scene.device, comm)
     with open_truth(comm, directory / STAGES["dns"].file, device) as truth:
         model = load_model(definition, comm, source.path, truth.scales).to(device).forced(truth.forcing)
