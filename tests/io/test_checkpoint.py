@@ -114,8 +114,7 @@ def test_other_names_are_no_checkpoints(comm, tmp_path):
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("name, rank", [("step-00000002.h5", 0), ("frames-00000000.h5", 0),
-                                        ("step-00000002.h5", -1), ("frames-00000000.h5", -1)])
+@pytest.mark.parametrize("name, rank", [("step-00000002.h5", 0), ("frames-00000000.h5", -1)])
 def test_what_the_system_refuses_to_read_is_kept(comm, tmp_path, monkeypatch, name, rank):
     """It may be sound. All ranks raise, also if only the last one cannot read the file."""
     directory = fill(comm, tmp_path, [1])

@@ -14,6 +14,7 @@ from eddies.io.checksums import ATTRIBUTE, BLOCK_BYTES, PIECE, find_damage, tabl
 from eddies.io.errors import ProductError
 from eddies.io.hdf5 import (append_frame, create_product, growing_dataset, open_product, read_frame, read_table,
                             write_table)
+from eddies.io.weights import load_weights, save_weights
 from tests.changed_product import changed
 
 FRAMES, SHAPE = 5, (4, 300)  # a frame has nearly two and a half blocks
@@ -49,13 +50,6 @@ def harm(comm, path, at):
         content[at] ^= 255
         path.write_bytes(content)
     comm.Barrier()
-
-
-@pytest.mark.mpi(1, 3)
-def test_other_programs_read_a_product(comm, path):
-    with h5py.File(path) as file:
-        assert "CRC-32" in file.attrs[ATTRIBUTE]
-        assert all(np.array_equal(file["series"][frame], values(frame)) for frame in range(FRAMES))
 
 
 @pytest.mark.mpi(1, 2)
@@ -112,17 +106,16 @@ def test_changes_by_other_programs(comm, path):
         assert np.array_equal(file["series"][3], values(3))
 
 
-@pytest.mark.mpi(1)
-def test_an_array_that_is_read_in_pieces(comm, tmp_path):
-    many = np.random.default_rng(1).random(3 * PIECE * BLOCK_BYTES // 16)
-    with create_product(comm, tmp_path / "a.h5", "kernel", {}) as file:
-        write_table(file, "table", {"many": many})
-    with open_product(comm, tmp_path / "a.h5", "kernel") as file:
-        assert np.array_equal(read_table(file, "table")["many"], many)
-        place = file["table/many"].id.get_offset()
-    harm(comm, tmp_path / "a.h5", place + many.nbytes - 1)
-    with open_product(comm, tmp_path / "a.h5", "kernel") as file, pytest.raises(ProductError, match="table/many "):
-        read_table(file, "table")
+@pytest.mark.mpi(1, 2)
+def test_weights_that_are_read_in_pieces(comm, tmp_path):
+    many, path = np.random.default_rng(1).random(3 * PIECE * BLOCK_BYTES // 16), tmp_path / "model.h5"
+    save_weights(comm, path, "model", {}, {"many": many}, {})
+    assert np.array_equal(load_weights(comm, path, "model").weights["many"], many)
+    with h5py.File(path) as file:
+        place = file["weights/many"].id.get_offset()
+    harm(comm, path, place + many.nbytes - 2 * BLOCK_BYTES)
+    with pytest.raises(ProductError, match="model.h5: the file is damaged: .* weights/many "):
+        load_weights(comm, path, "model")
 
 
 @pytest.mark.mpi(1, 3)

@@ -17,9 +17,9 @@ LAYOUT = FrameLayout(1.0, {"all": TrajectoryLayout(5, {"velocity": (3,), "densit
 
 @pytest.mark.mpi(1, 3)
 def test_images_are_counted_over_all_segments(comm, tmp_path):
-    """A particle that goes on through the box, segment by segment, on whichever rank its row is; another stays."""
+    """A particle goes far out of the box and back, segment by segment, on whichever rank its row is; another stays."""
     layout = FrameLayout(2.0, {"model": TrajectoryLayout(2, {"position": (3,)})}, np.float64, {})
-    paths = np.stack([np.outer(np.arange(6), [0.7, -0.9, 0.3]), np.zeros((6, 3))], axis=1) + 1.0
+    paths = np.stack([np.outer([0, 1, 2, 3, 4, 3, 2, 1], [0.7, -0.9, 0.3]), np.zeros((8, 3))], axis=1) + 1.0
     start, stop = id_block(comm, 2)
     with FrameSegments(comm, tmp_path, layout) as segments:
         for step, frame in enumerate(paths):
