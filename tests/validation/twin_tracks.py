@@ -7,8 +7,9 @@
 
 Writes the tracks of each case as a user would have them, reconstructs them, and compares the fields, after the filter
 of the stored ones, with these. Then forecasts the flow from the first field: the model `resolved` with weights of
-another flow of `hit`, and grids that start from the particles. Prints means over the runs, of fields at all times after
-the first t_eta, and the standard deviations of several runs, and writes docs/results/tracks-NAME.json.
+another flow of `hit`, and grids that start from the particles. At last trains `resolved` on tracks of the whole flow.
+Prints means over the runs, of fields at all times after the first t_eta, and the standard deviations of several runs,
+and writes docs/results/tracks-NAME.json.
 """
 
 import json
@@ -76,6 +77,21 @@ simulation.method = "eulerian"
 eulerian.cells = {cells}
 eulerian.start = "particles"
 """
+# A scene that learns a model from tracks of the whole flow.
+LEARN = """
+[model]
+preset = "resolved"
+[training]
+window = 0.4
+frames = 8
+batch = 1024
+steps = 300
+[simulation]
+frame_interval = 0.1
+turnovers = 0.5
+[variant.resolved]
+"""
+LEARNED = {"hit": ("whole-16", "whole-32"), "hit-256": ()}
 WEIGHTS = {"hit": {"filtered-16": "eddies:hit-coarse", "filtered-32": "eddies:hit"},
            "hit-256": {"filtered-16": "eddies:hit-256", "filtered-32": "eddies:hit-256"}}
 COLUMNS = "velocity_error_early", "velocity_error_half", "velocity_error_end", "end", "wall_seconds"
@@ -200,6 +216,31 @@ def forecasts_of(tracks: str, weights: str, run: Path, seed: int) -> dict[str, d
     return {row["name"]: {key: row[key] for key in COLUMNS} for row in rows}
 
 
+def learned_of(tracks: str, run: Path, seed: int) -> dict[str, float | None]:
+    """Errors of the particles that follow the fields of tracks of the whole flow, and of `resolved` trained on them.
+
+    The particles are compared with filtered tracers of the simulation that start at the same places: velocities, and
+    accelerations as central differences, mean over the frames after t_eta. `resolved` is compared with the particles.
+    Collective.
+    """
+    comm, found, side = MPI.COMM_WORLD, {}, tracks.partition("-")[2]
+    with made(Case(tracks), run, seed, LEARN) as directory:
+        if comm.rank == 0:
+            with h5py.File(directory / "ground_truth.h5") as own, h5py.File(
+                    run / f"filtered-{side}/ground_truth.h5") as true:
+                velocities = [file["particles/tracers/velocity/value"][()] for file in (own, true)]
+                times = own["particles/tracers/velocity/time"][()]
+                late = times[1:-1] > true["reference"].attrs["kolmogorov_time"]
+            for name, values in {"velocity": [each[1:-1] for each in velocities],
+                                 "acceleration": [each[2:] - each[:-2] for each in velocities]}.items():
+                mine, exact = (each[late] for each in values)
+                found[f"particle_{name}_error"] = float(np.mean(
+                    np.linalg.norm(mine - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))))
+            row, = json.loads((directory / "report/variants.json").read_text(encoding="utf-8"))["rows"]
+            found |= {key: row[key] for key in COLUMNS}
+    return comm.bcast(found)
+
+
 def combined(found: list[dict[str, float | None]]) -> dict[str, float]:
     """Means, and standard deviations of several runs, of the numbers that all of them have."""
     values = {name: [each[name] for each in found] for name in found[0]}
@@ -219,10 +260,12 @@ def main(name: str, runs: list[Path]) -> None:
         found = [forecasts_of(tracks, weights, run, seed) for seed, run in enumerate(runs)]
         forecasts += [{"tracks": tracks, "method": method} | combined([each[method] for each in found])
                       for method in found[0]]
+    learned = [{"tracks": tracks} | combined([learned_of(tracks, run, seed) for seed, run in enumerate(runs)])
+               for tracks in LEARNED[name]]
     if MPI.COMM_WORLD.rank == 0:
-        text = json.dumps({"fields": fields, "forecasts": forecasts}, indent=1) + "\n"
+        text = json.dumps({"fields": fields, "forecasts": forecasts, "learned": learned}, indent=1) + "\n"
         (RESULTS / f"tracks-{name}.json").write_text(text, encoding="utf-8")
-        for row in [*fields, *forecasts]:
+        for row in [*fields, *forecasts, *learned]:
             print(row)
 
 

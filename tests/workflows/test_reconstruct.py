@@ -103,6 +103,24 @@ def test_validation_estimates_the_true_error(comm, flow, tmp_path, linked, metho
     assert shapes["velocity"][1:] == (3, 20, 20, 20) and shapes["q"][1:] == (1, 20, 20, 20)
 
 
+@pytest.mark.mpi(1)
+def test_memory_finds_scales_of_an_unfiltered_flow_that_one_frame_does_not_determine(comm, tmp_path):
+    """8^3 tracers resolve wavenumbers up to 6 in one frame; the flow has them up to 11."""
+    scene = prepared(comm, tmp_path, removals=["kernel", "model", "training", "simulation"], overrides=[
+        "tracers.particles_per_side=8", "tracers.filtered=false", "flow.cells=24", "flow.viscosity=0.02",
+        "tracers.turnovers=1.2"])
+    errors, highest = {}, {}
+    for method in ("least-squares", "memory"):
+        settings = Reconstruction(method=method, fields=("velocity",), holdout=0.0)
+        reconstruct.run(replace(scene, reconstruction=settings), comm, tmp_path)
+        with h5py.File(tmp_path / "reconstruction.h5") as file:
+            errors[method] = file["errors_of_fields/velocity_error"][-5:].mean()
+            highest[method] = file["about"].attrs["highest_wavenumber"]
+    assert highest == {"least-squares": 6, "memory": 12}
+    # Measured: 0.49.
+    assert errors["memory"] < 0.6 * errors["least-squares"]
+
+
 @pytest.mark.mpi(2, 3)
 def test_fields_do_not_depend_on_the_number_of_ranks(comm, flow, tmp_path, linked):
     errors, _ = errors_of(comm, flow, tmp_path, linked, method="memory", fields=("velocity",))

@@ -191,6 +191,11 @@ class Scene(Section):
                     or self.rollout_is_forced)
 
     @property
+    def tracers_resolving(self) -> Tracers:
+        """Tracers that would resolve the modes of [reconstruction] in one frame."""
+        return self.reconstruction.resolving(self.tracers, (self.tracks or self.tracers).filtered)
+
+    @property
     def coarse_cells(self) -> int:
         """Cells along each side of the coarse grid that moves the particles of the rollout; 0 without one."""
         if self.simulation is None or self.tracers is None or not self.simulation.on_grid:

@@ -395,6 +395,15 @@ class Reconstruction(Section):
         """Whether the method estimates each grid point from the particles around it."""
         return self.method not in ("least-squares", "memory")
 
+    def resolving(self, tracers: Tracers, filtered: bool) -> Tracers:
+        """Tracers that would resolve the modes of the reconstruction in one frame.
+
+        For a memory of an unfiltered flow these are eight times as many: it keeps modes that `tracers` determine only
+        over several frames (docs/tracks.md). For `filtered` tracks more modes gain little: undoing the filter amplifies
+        their errors.
+        """
+        return tracers.with_count(8 * tracers.particles) if self.method == "memory" and not filtered else tracers
+
 
 @dataclass(frozen=True, kw_only=True)
 class Horizons(Section):

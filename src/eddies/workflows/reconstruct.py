@@ -39,8 +39,8 @@ from eddies.workflows.ground_truth.track_frames import TrackFrames
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import load_form
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
-from eddies.workflows.track_solver import (HELD_OUT, NO_FILTER, best_solver, particles_on, solver_of, split,
-                                           validation_error)
+from eddies.workflows.track_solver import (HELD_OUT, NO_FILTER, LeastSquaresMethod, best_solver, particles_on,
+                                           solver_of, split, validation_error)
 
 log = logging.getLogger("eddies")
 
@@ -57,25 +57,6 @@ class Method(Protocol):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore a state from `state_dict`."""
-
-
-class LeastSquaresMethod:
-    """Fits the modes to each frame alone by least squares. The solve starts from the modes of the previous frame."""
-
-    def __init__(self, solver: ResolvedVelocity) -> None:
-        self._solver = solver
-        self._near: Tensor | None = None
-
-    @torch.no_grad()
-    def of(self, particles: ParticleSet, time: float) -> Tensor:
-        self._near = self._solver.of(particles, near=self._near).velocity
-        return self._near
-
-    def state_dict(self) -> dict[str, Any]:
-        return {"modes": self._near}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self._near = state["modes"]
 
 
 class NeighbourMethod(Method):
@@ -99,21 +80,24 @@ class Source:
     Attributes
     ----------
     times : times of the frames. spacing : mean distance of the particles.
+    slab : this rank's part of the box, with the planes of the grid of the modes. resolved_spacing : the distance of
+    particles that would resolve these modes in one frame.
     most : largest number of particles in a frame. truth : the ground truth with true fields; None for measured tracks.
     unit, corner : the scene's unit of length and the place of the tracks' origin in the cube, both in the tracks' unit.
     """
 
-    def __init__(self, tracks: Tracks | None, tracers: Tracers, file: File, comm: Comm) -> None:
+    def __init__(self, tracks: Tracks | None, tracers: Tracers, settings: Reconstruction, file: File,
+                 comm: Comm) -> None:
         self._tracks, self.truth = None, None
         if tracks is not None:
             self._tracks = source = TrackFrames(comm, tracks)
             self.times, self.spacing, self.most = source.times, source.spacing, source.most
             self.unit, self.corner = source.about["length_unit"], source.about["corner"]
-            planes = tracers.with_count(round((BOX_LENGTH / self.spacing) ** 3)).planes
-            self.slab = SlabDecomposition(comm, BOX_LENGTH, planes)
-        else:
-            self.truth = truth = GroundTruth(file, comm)
-            self.slab = truth.decomposition
+            tracers = tracers.with_count(source.even_count)
+        resolved = settings.resolving(tracers, (tracks or tracers).filtered)
+        self.slab, self.resolved_spacing = SlabDecomposition(comm, BOX_LENGTH, resolved.planes), resolved.spacing
+        if tracks is None:
+            self.truth = truth = GroundTruth(file, comm, planes=resolved.planes)
             self.times, self.spacing, self.most = truth.times, tracers.spacing, truth.total
             self.unit, self.corner = 1.0, np.zeros(3)
 
@@ -242,11 +226,12 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     guard = Guard(comm, directory / STAGES["reconstruct"].checkpoints, stage_fingerprint(scene, "reconstruct"), stop,
                   " of the reconstruction")
     with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as file:
-        source, reference = Source(scene.tracks, tracers, file, comm), read_attributes(file, "reference")
+        source = Source(scene.tracks, tracers, settings, file, comm)
+        reference = read_attributes(file, "reference")
         filtered = (scene.tracks or tracers).filtered
         width = tracers.filter_width if filtered else NO_FILTER * source.spacing
         solver, weight, _ = best_solver(source.particles(0), partial(
-            solver_of, source.slab, reference | {"spacing": source.spacing, "filter_width": width}),
+            solver_of, source.slab, reference | {"spacing": source.resolved_spacing, "filter_width": width}),
             settings.holdout or HELD_OUT)
         grid = solver.grid
         transfer = grid.filter_transfer(tracers.filter_width) if filtered else torch.ones_like(grid.shell)

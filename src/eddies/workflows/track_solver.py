@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_sum
@@ -21,6 +23,25 @@ RISE = 1.02             # the search ends when the error exceeds the least error
 HELD_OUT = 0.1          # share of the particles that cross-validation leaves out
 KNUTH = 2654435761      # spreads ids evenly over 32 bits
 NO_FILTER = 1e-3        # filter width divided by the spacing, for an unfiltered flow
+
+
+class LeastSquaresMethod:
+    """Fits the modes to each frame alone by least squares. The solve starts from the modes of the previous frame."""
+
+    def __init__(self, solver: ResolvedVelocity) -> None:
+        self._solver = solver
+        self._near: Tensor | None = None
+
+    @torch.no_grad()
+    def of(self, particles: ParticleSet, time: float) -> Tensor:
+        self._near = self._solver.of(particles, near=self._near).velocity
+        return self._near
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"modes": self._near}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self._near = state["modes"]
 
 
 def best_solver(particles: ParticleSet, make: Callable[[float], ResolvedVelocity],
@@ -55,7 +76,7 @@ def split(particles: ParticleSet, share: float) -> tuple[ParticleSet, ParticleSe
     return known, held
 
 
-def validation_error(solver: ResolvedVelocity, modes: torch.Tensor, known: ParticleSet, held_out: ParticleSet) -> float:
+def validation_error(solver: ResolvedVelocity, modes: Tensor, known: ParticleSet, held_out: ParticleSet) -> float:
     """Normalised L2 error of modes at the particles that were left out. The modes are those of the velocity minus the
     mean velocity of the `known` particles. NaN if no particle was left out. Collective."""
     comm = solver.grid.decomposition.comm

@@ -34,7 +34,7 @@ from eddies.scene.sections import Eulerian, Initial, Reconstruction, Tracks
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.workflows.ground_truth.track_frames import TrackFrames, read_measured
 from eddies.workflows.run_directory.fingerprints import stage_provenance
-from eddies.workflows.track_solver import NO_FILTER, best_solver, particles_on, solver_of
+from eddies.workflows.track_solver import NO_FILTER, LeastSquaresMethod, best_solver, particles_on, solver_of
 
 log = logging.getLogger("eddies")
 
@@ -129,9 +129,11 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     for the measured velocity and integral scale (`dissipation_constant`).
     """
     tracers, tracks, filtered = scene.tracers, TrackFrames(comm, scene.tracks), scene.tracks.filtered
-    viscosity = scene.flow.viscosity
+    viscosity, follows = scene.flow.viscosity, tracers.filtered and not filtered
     complete, times, spacing = tracks.complete, tracks.times, tracks.spacing
-    slab = SlabDecomposition(comm, BOX_LENGTH, tracers.with_count(round((BOX_LENGTH / spacing) ** 3)).planes)
+    settings = Reconstruction(method="memory" if follows and viscosity > 0 else "least-squares")
+    resolved = settings.resolving(tracers.with_count(tracks.even_count), filtered)
+    slab = SlabDecomposition(comm, BOX_LENGTH, resolved.planes)
     first, second = tracks.shared(0, 1), tracks.shared(1, 0)
     reference = {"filter_width": tracers.filter_width, "spacing": tracers.spacing, "density_mean": 1.0,
                  "viscosity": viscosity, **measured_scales(comm, first, second, times[1])}
@@ -139,7 +141,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     particles = particles_on(slab, tracks.frame(0))
     found = {"kolmogorov_length": 0.0} | reference
     for _ in range(2 if viscosity > 0 else 1):  # the second time with Kolmogorov's length in the prior
-        make = partial(solver_of, slab, found | {"spacing": spacing, "filter_width": width})
+        make = partial(solver_of, slab, found | {"spacing": resolved.spacing, "filter_width": width})
         solver, weight, error = best_solver(particles, make)
         flow = FrameFlow(solver.grid, solver.of(particles).velocity, particles, filtered, tracers.filter_width)
         found = flow.scales(viscosity) | reference  # velocity_rms is that of the particles
@@ -150,35 +152,33 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         sound["mach_turbulent"] = math.sqrt(2 * flow.energy.sum()) / scene.flow.sound_speed
     with create_product(comm, Path(directory) / STAGES["dns"].file, "ground_truth",
                         stage_provenance(scene, "dns")) as file:
-        trajectory = traced = memory = None
+        traced, paths = FilteredTracers(slab, tracks.frame(0)) if follows else None, []
+        count = traced.total if traced else complete
         shapes = {name: values.shape[1:] for name, values in first.items() if name != "id"}
-        if tracers.filtered and not filtered:
-            traced, paths = FilteredTracers(slab, tracks.frame(0)), []
-            if viscosity > 0:
-                memory = RememberedVelocity(solver, viscosity, torch.ones_like(solver.grid.shell),
-                                            Reconstruction().memory, weight)
-        if traced is not None or complete >= LEAST_TRACKS:
-            count = complete if traced is None else traced.total
-            trajectory = TrajectoryWriter(file, "tracers", count, BOX_LENGTH, shapes, np.float64)
+        trajectory = (TrajectoryWriter(file, "tracers", count, BOX_LENGTH, shapes, np.float64)
+                      if count >= LEAST_TRACKS else None)
         fields = FieldWriter(file, "filtered", coarse.cells, {"velocity": 3})
-        rows, spectra, near = [], [], None
+        method = (LeastSquaresMethod(solver) if settings.method == "least-squares" else RememberedVelocity(
+            solver, viscosity, torch.ones_like(solver.grid.shell), settings.memory, weight))
+        rows, spectra = [], []
         for frame, time in enumerate(times):
             if stop is not None:
                 stop.check()
-            if trajectory is not None and traced is None:
-                trajectory.append(frame, time, id_block(comm, complete)[0], tracks.frame(frame, complete=True))
-            if frame % tracers.field_every and traced is None:
-                continue
-            particles = particles_on(slab, tracks.frame(frame))
-            with torch.no_grad():
-                near = memory.of(particles, time) if memory else solver.of(particles, near=near).velocity
-                flow = FrameFlow(solver.grid, near, particles, filtered, tracers.filter_width)
-            if traced is not None:
+            stored = frame % tracers.field_every == 0
+            if stored or traced:
+                particles = particles_on(slab, tracks.frame(frame))
+                with torch.no_grad():
+                    flow = FrameFlow(solver.grid, method.of(particles, time), particles, filtered,
+                                     tracers.filter_width)
+            if traced:
                 start, columns = traced.follow(flow, times[1] if frame else 0.0)
-                trajectory.append(frame, time, start, columns)
                 paths += [columns] if frame < 2 else []
-                if frame % tracers.field_every:
-                    continue
+            else:
+                start, columns = id_block(comm, complete)[0], tracks.frame(frame, complete=True)
+            if trajectory:
+                trajectory.append(frame, time, start, columns)
+            if not stored:
+                continue
             grid, modes = flow.grid.spectral, as_numpy(flow.filtered)
             planes = coarse.backward(regrid(grid, coarse, modes)) + flow.mean[:, None, None, None]
             fields.append(time, coarse.decomposition.start, {"velocity": planes})

@@ -62,7 +62,7 @@ def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
             return None
         settings = scene.reconstruction
         calls = (1 + (settings.holdout > 0)) * math.ceil((expected.frame_intervals + 1) / settings.every)
-        transforms, pairs = calls * COLD * ITERATION * tracers.planes**3, 0.0
+        transforms, pairs = calls * COLD * ITERATION * scene.tracers_resolving.planes**3, 0.0
         if settings.method in FORM_PAIRS:
             transforms, pairs = 0.0, calls * NEIGHBORS * tracers.planes**3 * FORM_PAIRS[settings.method]
     elif stage == "train":

@@ -51,9 +51,11 @@ def storage(scene: Scene, stage: str, ranks: int) -> Storage:
         return Storage(REPORT_PROCESS, REPORT_BYTES)
     if stage == "train-kernel":  # planes of five reconstructions, velocity and gradient
         return Storage(kernel_memory(kernel, tracers, ranks), PRODUCT_BYTES + 80 * tracers.cells**2 + 64 * kernel.steps)
+    planes = tracers.planes if scene.needs_resolved_velocity or stage != "train" else 0
+    if stage == "reconstruct":
+        planes = scene.tracers_resolving.planes
     evaluation = evaluation_memory(tracers, ranks, scene.neighbors if model and "pairs" in model.reads else 0.0,
-                                   scene.simulation.skin if scene.simulation else 0.0,
-                                   scene.needs_resolved_velocity or stage != "train")
+                                   scene.simulation.skin if scene.simulation else 0.0, planes)
     if stage == "train":         # samples of rates, and the history
         training = scene.own_training
         if scene.training and scene.training.field_weight > 0:
@@ -90,12 +92,11 @@ def kernel_memory(kernel: Kernel, tracers: Tracers, ranks: int) -> float:
     return TORCH_PROCESS + KERNEL_FIELDS * TABLE_BYTES * tracers.particles / ranks + lists * kernel.neighbors
 
 
-def evaluation_memory(tracers: Tracers, ranks: int, neighbors: float, skin: float, on_grid: bool) -> float:
-    """Memory of a rank in an evaluation of the model. `neighbors` is 0 for a model without pairs."""
-    own, planes = tracers.particles / ranks, tracers.planes
-    size = PARTICLE_BYTES * own
-    if on_grid:
-        size += POINT_BYTES * planes**2 * math.ceil(planes / ranks)
+def evaluation_memory(tracers: Tracers, ranks: int, neighbors: float, skin: float, planes: int) -> float:
+    """Memory of a rank in an evaluation of the model. `neighbors` is 0 for a model without pairs. `planes` are those of
+    the grid of the resolved velocity, 0 without it."""
+    own = tracers.particles / ranks
+    size = PARTICLE_BYTES * own + POINT_BYTES * planes**2 * math.ceil(planes / ranks)
     if neighbors:
         ghosts = tracers.particles * tracers.radius_of(neighbors) * (1 + skin) / math.pi if ranks > 1 else 0.0
         size += PARTICLE_BYTES * ghosts + NEIGHBOR_BYTES * neighbors * (1 + skin) ** 3 * own

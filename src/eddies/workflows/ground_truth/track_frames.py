@@ -82,6 +82,11 @@ class TrackFrames:
                                           found.complete, found.spacing, int(np.diff(found.starts).max())))
         self._tracks = read_measured(settings) if comm.rank == 0 else None
 
+    @property
+    def even_count(self) -> int:
+        """Number of particles with the tracks' spacing that fill the periodic cube."""
+        return round((BOX_LENGTH / self.spacing) ** 3)
+
     def frame(self, number: int, complete: bool = False) -> dict[str, np.ndarray]:
         """This rank's block of the rows of a frame (`MeasuredTracks.frame`)."""
         return self._block(lambda tracks: tracks.frame(number, complete))
