@@ -19,8 +19,6 @@ ITERATIONS = 6
 CLOSURES = {
     "pressure": {"pressure": {}, "pairs": {}},
     "resolved + pairs": PRESETS["resolved + pairs"],
-    "resolved": PRESETS["resolved"],
-    "pairs without density": {"pairs": dict(inputs=("distance", "speed", "approach"))},
     "own density": {**OWN_DENSITY, "eddy-viscosity": dict(form="monaghan")},
     "paper": {"pairs": dict(basis="paper", hidden=(8, 8)), "density-flux": dict(hidden=(8, 8)),
               "eddy-viscosity": dict(form="two-sided", basis="paper")},
