@@ -191,8 +191,10 @@ class Scene(Section):
                     or self.rollout_is_forced)
 
     @property
-    def tracers_resolving(self) -> Tracers:
-        """Tracers that would resolve the modes of [reconstruction] in one frame."""
+    def tracers_resolving(self) -> Tracers | None:
+        """Tracers that would resolve the modes of [reconstruction] in one frame; None without this section."""
+        if self.reconstruction is None or self.tracers is None:
+            return None
         return self.reconstruction.resolving(self.tracers, (self.tracks or self.tracers).filtered)
 
     @property
