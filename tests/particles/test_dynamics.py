@@ -146,17 +146,6 @@ def test_terms_read_the_density_that_others_give(comm, stored):
     assert_close(by_id(comm, particles, rates.density, 200), sine)
 
 
-@pytest.mark.mpi(2)
-@pytest.mark.parametrize("name", ["corrected", "pairs with density"])
-def test_single_precision_differs_by_rounding(comm, name):
-    slab, particles = distributed(comm, *state())
-    double = dynamics_of(slab, model(MODELS[name]), iterations=ITERATIONS).rates(particles)
-    single = dynamics_of(slab, model(MODELS[name]).float(), iterations=ITERATIONS, dtype=torch.float32).rates(particles)
-    assert given(single).keys() == given(double).keys()
-    for rate, exact in zip(given(single).values(), given(double).values()):
-        assert rate.dtype == torch.float64 and 0 < (rate - exact).norm() < 1e-5 * exact.norm()
-
-
 @pytest.mark.mpi(1, 2)
 def test_settled_particles_stay_until_one_moves_too_far(comm):
     slab, particles = distributed(comm, *state())

@@ -13,7 +13,7 @@ from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity, dissipation_range
 from tests.particles.configurations import (
-    LENGTH, along, assert_close, by_id, density_reader, distributed, dynamics_of, model, of_terms, positions,
+    LENGTH, along, assert_close, density_reader, distributed, dynamics_of, model, of_terms, positions,
 )
 from tests.validation import filtered_fields
 
@@ -166,42 +166,20 @@ def test_energies_of_known_waves_by_bands(comm):
         assert float((gradient * velocity).sum()) == pytest.approx(2 * float(bands[band]), rel=1e-6)
 
 
-def particles_around_a_void(comm):
-    """The slabs, particles with random velocities in seven octants of the box, and their number."""
+@pytest.mark.mpi(2)
+def test_the_resolved_velocity_is_solenoidal_and_what_it_misses_is_the_rest(comm):
+    """Of particles with random velocities in seven octants of the box."""
     random = np.random.default_rng(8)
     position = random.uniform(0, LENGTH, (700, 3))
     position = position[(position > LENGTH / 2).any(1)]
-    velocity = random.standard_normal(position.shape)
-    return *distributed(comm, torch.from_numpy(position), torch.from_numpy(velocity), planes=PLANES), len(position)
-
-
-@pytest.mark.mpi(2)
-def test_the_frame_of_reference_changes_nothing(comm):
-    """Density and force are the same in a moving frame, so their derivatives by a uniform velocity are zero."""
-    slab, particles, _ = particles_around_a_void(comm)
-    dynamics = dynamics_of(slab, lagrangian(), iterations=20, fixed_ranks=True)
-    velocity = particles.velocity.requires_grad_()
-    still = dynamics.rates(replace(particles, velocity=velocity))
-    carried = dynamics.rates(replace(particles, velocity=velocity.detach() + torch.tensor([5.0, -3.0, 10.0])))
-    for name in ("density", "acceleration"):
-        size = float(getattr(still, name).abs().max())
-        assert torch.allclose(getattr(carried, name), getattr(still, name).detach(), rtol=0, atol=1e-11 * size)
-    weights = torch.from_numpy(np.random.default_rng(comm.rank).standard_normal(particles.position.shape))
-    ((weights * still.acceleration).sum() + 100 * (weights[:, 0] * still.density).sum()).backward()
-    by_frame = global_sum(comm, velocity.grad.sum(0).numpy())
-    by_each = float(global_sum(comm, float(velocity.grad.abs().sum())))
-    assert np.abs(by_frame).max() < 1e-13 * by_each
-
-
-@pytest.mark.mpi(2)
-def test_the_resolved_velocity_is_solenoidal_and_what_it_misses_is_the_rest(comm):
-    slab, particles, count = particles_around_a_void(comm)
+    velocity = torch.from_numpy(random.standard_normal(position.shape))
+    slab, particles = distributed(comm, torch.from_numpy(position), velocity, planes=PLANES)
     flow = resolution_on(slab).of(particles)
     # The rounding of each iteration adds up.
     assert flow.grid.divergence(flow.velocity).abs().max() < 1e-11 * flow.velocity.abs().max()
     assert torch.equal(flow.velocity, flow.grid.within(flow.velocity))
-    mean = by_id(comm, particles, particles.velocity, count).mean(0)
-    assert_close(flow.missing(), particles.velocity - mean - flow.at_particles(flow.velocity), 1e-12)
+    expected = particles.velocity - velocity.mean(0) - flow.at_particles(flow.velocity)
+    assert_close(flow.missing(), expected, 1e-12)
 
 
 @pytest.mark.mpi(1)
