@@ -69,7 +69,7 @@ def test_a_model_that_is_the_stationary_flow_but_for_a_factor():
     assert rms["model"] == pytest.approx(1.1 * rms["flow at the start"], rel=1e-12)
     for name in ("velocity_kl", "acceleration_kl", "qr_kl"):
         assert value[name] == pytest.approx(0, abs=1e-9)
-    assert png(shown.illustrations[0].image).startswith(b"\x89PNG")
+    assert png(shown.illustrations[0].figure).startswith(b"\x89PNG")
 
 
 def test_frames_after_the_first_broken_one_do_not_count():

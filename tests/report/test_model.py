@@ -36,4 +36,4 @@ def test_coefficients_are_written_as_learned_and_in_the_units_of_the_flow():
     assert one.written == "0.1, that is 0.25 L/T" and several.written == "0.1, 0.2"
     section = Section("model", "Model", metrics=[one, training_metrics({})[0]])
     assert '"value": 0.25,\n      "unit": "L/T"' in metrics_json([], [section])
-    assert "0.1, that is 0.25 L/T" in render_page(RunRecord("run", "", "", [("stage",)]), [section], {})
+    assert "0.1, that is 0.25 L/T" in render_page(RunRecord("run", "", "", [("stage",)]), [section])

@@ -12,7 +12,7 @@ def test_a_value_that_is_not_finite_is_missing_on_the_page_and_null_in_the_file(
         Metric("skewness", "skewness", {"this run": float("nan"), "literature": -0.5})]),
         Section("model", "Model", metrics=[Metric("error", "its error", float("inf"), "too few frames"),
                                            Metric("terms", "terms", 3)])]
-    page = render_page(RUN, sections, {})
+    page = render_page(RUN, sections)
     assert "<td>not available</td><td>-0.5</td>" in page and "not available: too few frames" in page
     assert json.loads(metrics_json(["a warning"], sections)) == {
         "warnings": ["a warning"], "stationary": {"skewness": {"this run": None, "literature": -0.5}},
@@ -21,7 +21,7 @@ def test_a_value_that_is_not_finite_is_missing_on_the_page_and_null_in_the_file(
 
 def test_text_is_escaped():
     section = Section("model", "A & B", "x < y", notices=["<script>"], metrics=[Metric("unit", "1 < 2", "<b>")])
-    page = render_page(RUN, [section], {})
+    page = render_page(RUN, [section])
     for text in ("a &lt;b&gt; &amp; c", "A &amp; B", "x &lt; y", "&lt;script&gt;", "1 &lt; 2", "&lt;b&gt;"):
         assert text in page
 
@@ -31,7 +31,8 @@ def test_figures_stand_in_the_page_and_one_that_was_not_drawn_is_left_out():
     section.add_figure("drawn", "A figure", None, "Its caption")
     section.add_figure("failed", "Another", None, "Its own")
     # The width of a PNG file, in bytes 16 to 19, is given at 96 of 150 dots per inch.
-    page = render_page(RUN, [section], {"drawn": b"\x89PNG\r\n\x1a\n" + bytes(8) + (300).to_bytes(4, "big")})
+    section.illustrations[0].png = b"\x89PNG\r\n\x1a\n" + bytes(8) + (300).to_bytes(4, "big")
+    page = render_page(RUN, [section])
     assert 'width="192" src="data:image/png;base64,iVBORw0KGgo' in page and "Its caption" in page
     assert "Another" not in page
 
@@ -39,7 +40,7 @@ def test_figures_stand_in_the_page_and_one_that_was_not_drawn_is_left_out():
 def test_a_folded_section_shows_its_main_numbers_and_opens_without_a_script():
     kernel = Section("kernel", "Kernel", "All.", metrics=[Metric("error", "its error", 0.25)], main=("error",),
                      folded=True)
-    page = render_page(RUN, [kernel], {})
+    page = render_page(RUN, [kernel])
     summary = page[page.index("<details><summary>"):page.index("</summary>")]
     assert "Kernel" in summary and "0.25" in summary and "its error" in summary and "All." not in summary
     assert '<a href="#kernel">' in page and "<details open>" not in page and "<script" not in page

@@ -42,12 +42,16 @@ class Metric:
 
 @dataclass
 class Illustration:
-    """A figure of the page: name of its file without the ending, title, matplotlib figure, caption."""
+    """A figure of the page: name of its file without the ending, title, matplotlib figure, caption.
+
+    png: the figure as a PNG image; empty until it is drawn.
+    """
 
     name: str
     title: str
-    image: Any
+    figure: Any
     caption: str
+    png: bytes = b""
 
 
 @dataclass
@@ -120,28 +124,28 @@ def metrics_json(warnings: Sequence[str], sections: Sequence[Section]) -> str:
     return json.dumps(table, indent=2, allow_nan=False) + "\n"
 
 
-def write_page(output: Path, run: RunRecord, sections: Sequence[Section], images: Mapping[str, bytes],
-               beside: Mapping[str, str]) -> None:
+def write_page(output: Path, run: RunRecord, sections: Sequence[Section], beside: Mapping[str, str]) -> None:
     """Write index.html, metrics.json, figures/NAME.png and the texts `beside`, by file name. Remove older figures.
 
     Raises OSError or WriteError. If a file cannot be written, no existing file is changed.
     """
     earlier = (output / "metrics.json").exists()  # only then are other figures removed
     (output / "figures").mkdir(parents=True, exist_ok=True)
-    figures = {output / "figures" / f"{name}.png": image for name, image in images.items()}
-    texts = {"index.html": render_page(run, sections, images), "metrics.json": metrics_json(run.warnings, sections)}
-    write_files({**figures, **{output / name: text for name, text in (texts | dict(beside)).items()}})
+    figures = {output / "figures" / f"{each.name}.png": each.png
+               for section in sections for each in section.illustrations if each.png}
+    texts = {"index.html": render_page(run, sections), "metrics.json": metrics_json(run.warnings, sections), **beside}
+    write_files({**figures, **{output / name: text for name, text in texts.items()}})
     for path in (output / "figures").glob("*.png"):
         if earlier and path not in figures:
             path.unlink()
 
 
-def render_page(run: RunRecord, sections: Sequence[Section], images: Mapping[str, bytes]) -> str:
-    """Return the page as HTML. `images` holds PNG images by name of the figure; figures without one are left out."""
+def render_page(run: RunRecord, sections: Sequence[Section]) -> str:
+    """Return the page as HTML, without the figures that are not drawn."""
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"shown": shown, "embedded": _embedded}
     template = environment.from_string(Path(__file__).with_name("page.html").read_text(encoding="utf-8"))
-    return template.render(run=run, sections=sections, images=images)
+    return template.render(run=run, sections=sections)
 
 
 def _embedded(image: bytes) -> Markup:

@@ -67,7 +67,7 @@ class Page:
     """A page of the report, made by one rank.
 
     directory: run directory of the products. seconds: wall seconds by stage. provenance: provenance by kind of product.
-    not_finite: a sentence on each product with numbers that are not finite. images: PNG figures by name.
+    not_finite: a sentence on each product with numbers that are not finite.
     """
 
     directory: Path
@@ -78,22 +78,22 @@ class Page:
     cost: list[Metric] = field(default_factory=list)
     stationary: StationarySpan | None = None
     sections: list[Section] = field(default_factory=list)
-    images: dict[str, bytes] = field(default_factory=dict)
 
     @property
     def simulation_seconds(self) -> float | None:
         """Wall seconds per turnover of the direct simulation; None without one, or if it took no step."""
         return next((metric.value for metric in self.cost if metric.key == SIMULATION), None)
 
-    def draw(self, sections: Sequence[Section]) -> None:
-        """Draw the figures of sections, then free the figures. A figure that fails is left out with a warning."""
-        for figure in (each for section in sections for each in section.illustrations):
-            try:
-                self.images[figure.name] = figures.png(figure.image)
-            except Exception as error:  # an error of matplotlib or its settings must not lose the rest of the report
-                log.warning("report: a figure is left out, because drawing %s fails (%s: %s)", figure.name,
-                            type(error).__name__, error)
-            figure.image = None
+
+def _draw(sections: Sequence[Section]) -> None:
+    """Draw the figures of sections, then free them. A figure that fails is left out with a warning."""
+    for illustration in (each for section in sections for each in section.illustrations):
+        try:
+            illustration.png = figures.png(illustration.figure)
+        except Exception as error:  # an error of matplotlib or its settings must not lose the rest of the report
+            log.warning("report: a figure is left out, because drawing %s fails (%s: %s)", illustration.name,
+                        type(error).__name__, error)
+        illustration.figure = None
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ def _make(report: Report, comm: Comm, alone: Comm, stop: StopRequest,
                 page = made[name] = read_page(report.pages[name], alone, next(iter(measured[name]), None), scanned,
                                               main=name == report.main)
                 if draw:
-                    page.draw(page.sections)
+                    _draw(page.sections)
             if report.main and len(measured[name]) == len(report.runs[name]):
                 found[name] = [numbers(each) for each in measured[name]]
             for each in measured[name]:
@@ -447,7 +447,7 @@ def _write_main(scene: Scene | None, report: Report, page: Page, found: Mapping[
                 alone: Comm) -> None:
     """Write the main page, with the table of variants if there is one, and log its numbers; one rank calls it."""
     first, beside = _compare(scene, report, page, found, ranks, alone)
-    page.draw(first)
+    _draw(first)
     page.sections = [*first, *page.sections]
     page.seconds = {**read_stage_seconds(report.directory), **page.seconds}
     _write(report, page, report.directory, beside, scene.to_toml() if scene is not None and scene.variant else "")
@@ -477,4 +477,4 @@ def _write(report: Report, page: Page, directory: Path, beside: Mapping[str, str
     text = scene or list(page.provenance.values())[-1]["scene"]
     title = tomllib.loads(text).get("title", "untitled scene")
     record = RunRecord(directory.resolve().name, title, text, rows, page.warnings, report.links(directory))
-    write_page(report.report_of(directory), record, page.sections, page.images, beside or {})
+    write_page(report.report_of(directory), record, page.sections, beside or {})
