@@ -174,3 +174,15 @@ def test_a_refusal_of_the_system_is_no_damage(comm, path, monkeypatch):
             with open_product(comm, path, "rollout"):
                 pass
         assert "damaged" not in str(error.value) and "delete" not in str(error.value)
+
+
+@pytest.mark.mpi(1)
+def test_a_disk_that_fails_while_a_file_is_read_is_named(comm, path, monkeypatch):
+    with open_product(comm, path, "rollout") as file:
+        def fail(*_):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+        with monkeypatch.context() as patch, pytest.raises(ProductError, match="rollout.h5: cannot be read: Input"):
+            patch.setattr(os, "preadv", fail)
+            read_frame(file["series"], 2, (slice(None), slice(None)))
+        assert np.array_equal(file["series"][2], values(2))

@@ -8,6 +8,7 @@ functions import MPI.
 
 from __future__ import annotations
 
+import io
 import itertools
 import os
 import struct
@@ -58,45 +59,38 @@ def open_to_read(path: str | Path) -> h5py.File:
         return file
 
 
-class CheckedFile:
+class CheckedFile(io.FileIO):
     """A file object for h5py.File that checks each read. With `naming`, errors name the damaged dataset and frame."""
 
-    _descriptor: int | None = None
-
     def __init__(self, path: str | Path, naming: bool = True) -> None:
-        self.path, self._naming, self._at = Path(path), naming, 0
-        self._descriptor = os.open(path, os.O_RDONLY)
-        self._size = _covered_bytes(self._descriptor) or 0
+        super().__init__(path)
+        self._path, self._naming, self._size = Path(path), naming, _covered_bytes(self.fileno()) or 0
 
     def __repr__(self) -> str:
-        return str(self.path)  # h5py uses it as the name of the file
+        return str(self._path)  # h5py uses it as the name of the file
 
     def __del__(self) -> None:
-        if self._descriptor is not None:
-            os.close(self._descriptor)
+        self.close()  # without the warning that nobody has closed the file
 
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> None:
-        """Go to a position."""
-        self._at = offset + (self._size if whence == os.SEEK_END else 0)
-
-    def tell(self) -> int:
-        """The position."""
-        return self._at
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Go to a position. The end is that of the HDF5 data, before the checksums."""
+        return super().seek(offset + self._size) if whence == os.SEEK_END else super().seek(offset, whence)
 
     def readinto(self, buffer: memoryview) -> int:
-        """Fill a buffer with the bytes from the position on. ContentError if bytes differ from their checksums."""
-        done, size = 0, min(len(buffer), self._size - self._at)
+        """Fill a buffer with the bytes from the position on. ContentError if bytes differ from their checksums. The
+        position does not change: h5py sets it before each read."""
+        at, done = self.tell(), 0
+        size = min(len(buffer), self._size - at)
         while done < size:
-            first, skipped = divmod(self._at + done, BLOCK_BYTES)
+            first, skipped = divmod(at + done, BLOCK_BYTES)
             part = memoryview(buffer)[done:min(size, done + PIECE * BLOCK_BYTES - skipped)]
-            wrong = _first_wrong(self._descriptor, first, part, self._size, skipped)
+            with read_errors(self._path):
+                wrong = _first_wrong(self.fileno(), first, part, self._size, skipped)
             if wrong is not None:
-                words = _damage(self.path, wrong, self._naming)
-                raise ContentError(f"{words}; {remedy_for(self.path.stem)}")
+                words = _damage(self._path, wrong, self._naming)
+                raise ContentError(f"{words}; {remedy_for(self._path.stem)}")
             done += len(part)
         return done
-
-    read = readinto  # h5py requires this method, but calls `readinto`
 
 
 def add_checksums(comm: MPI.Comm, path: Path) -> None:
