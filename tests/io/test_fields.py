@@ -16,15 +16,18 @@ def field(index, variable):
     return np.random.default_rng([index, VARIABLES[variable]]).random(shape)
 
 
+def write(comm, path, start=0, stop=CELLS):
+    with create_product(comm, path, "ground_truth", {}) as file:
+        writer = FieldWriter(file, "filtered", CELLS, VARIABLES)
+        for index in range(2):
+            writer.append(0.1 * index, start, {name: field(index, name)[:, start:stop] for name in VARIABLES})
+
+
 @pytest.mark.mpi(1, 3)
 def test_fields_survive(comm, tmp_path):
     """The first of three ranks has all planes but one, the second none."""
     starts = [0, *[CELLS - 1] * (comm.size - 1), CELLS]
-    start, stop = starts[comm.rank], starts[comm.rank + 1]
-    with create_product(comm, tmp_path / "f.h5", "ground_truth", {}) as file:
-        writer = FieldWriter(file, "filtered", CELLS, VARIABLES)
-        for index in range(2):
-            writer.append(0.1 * index, start, {name: field(index, name)[:, start:stop] for name in VARIABLES})
+    write(comm, tmp_path / "f.h5", *starts[comm.rank:comm.rank + 2])
     with open_product(comm, tmp_path / "f.h5", "ground_truth") as file:
         series = FieldSeries(file, "filtered")
         assert np.array_equal(series.times, [0, 0.1])
@@ -44,10 +47,7 @@ def test_fields_survive(comm, tmp_path):
     (lambda group: group["time"].resize(1, 0), r"shape \(2, ., 6, 6, 6\).* 1 times"),
     (lambda group: group.attrs.modify("cells", 8), r"shape \(2, ., 6, 6, 6\).* 8 cells")])
 def test_malformed_series_are_refused(comm, tmp_path, change, message):
-    with create_product(comm, tmp_path / "f.h5", "ground_truth", {}) as file:
-        writer = FieldWriter(file, "filtered", CELLS, VARIABLES)
-        for index in range(2):
-            writer.append(0.1 * index, 0, {name: field(index, name) for name in VARIABLES})
+    write(comm, tmp_path / "f.h5")
     with changed(tmp_path / "f.h5") as file:
         change(file["fields/filtered"])
     with open_product(comm, tmp_path / "f.h5", "ground_truth") as file, pytest.raises(ProductError, match=message):

@@ -1,6 +1,7 @@
 """Data sets for learned simulators: by the rules of LagrangeBench's reader, they hold the paths of the particles."""
 
 import json
+from contextlib import ExitStack
 
 import h5py
 import numpy as np
@@ -30,20 +31,18 @@ def paths(times):
 @pytest.fixture
 def trajectory(comm, tmp_path):
     """A function that gives a stored trajectory: at equal intervals, unless other times are given."""
-    opened = []
+    files = ExitStack()
 
     def make(times=INTERVAL * np.arange(FRAMES), positions=None):
-        path, where = tmp_path / f"{len(opened)}.h5", paths(times) if positions is None else positions
+        path, where = tmp_path / f"{len([*tmp_path.iterdir()])}.h5", paths(times) if positions is None else positions
         with create_product(comm, path, "rollout", {}) as file:
             writer = TrajectoryWriter(file, "model", PARTICLES, LENGTH, {"position": (3,)}, np.float64)
             for step, (time, position) in enumerate(zip(times, where)):
                 writer.append(step, time, 0, {"position": position % LENGTH})
-        opened.append(open_product(comm, path, "rollout"))
-        return Trajectory(opened[-1].__enter__(), "model")
+        return Trajectory(files.enter_context(open_product(comm, path, "rollout")), "model")
 
-    yield make
-    for product in opened:
-        product.__exit__(None, None, None)
+    with files:
+        yield make
 
 
 def windows(path, length, stride):

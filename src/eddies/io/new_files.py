@@ -97,13 +97,12 @@ def new_file(comm: MPI.Comm, path: Path, checksums: bool = True) -> Iterator[h5p
                 on_all_ranks(comm, lambda: _force_to_disk(new.path))  # on every node
     except BaseException as error:
         _open.pop(new.name, None)
-        if new.broken or comm.size > 1 and not isinstance(error, Stopped | WriteError | RunTakenOver):
+        all_raise = comm.size == 1 or isinstance(error, Stopped | WriteError | RunTakenOver)
+        if new.broken or not all_raise or not new.try_to_close():
             _abandoned.append(new)
-        elif new.try_to_close():
+        else:
             with file_errors(new.path):
                 on_first_rank(comm, new.remove)
-        else:
-            _abandoned.append(new)
         raise
     with file_errors(path):
         on_first_rank(comm, lambda: new.publish(path))
