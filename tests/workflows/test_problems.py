@@ -2,6 +2,7 @@
 what only the flow tells."""
 
 import dataclasses
+import functools
 import logging
 import re
 
@@ -11,7 +12,8 @@ from eddies.scene.integrators import SCHEMES
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 from eddies.scene.terms import FilteredEquations, StepUnits
 from eddies.workflows.foreseen.storage import storage
-from eddies.workflows.problems import Context, convenient, memory_of_node, problems
+from eddies.workflows.ground_truth.frame_counts import check_frames
+from eddies.workflows.problems import Context, check_ground_truth, convenient, memory_of_node, problems
 from tests.bad_scenes import INFEASIBLE
 from tests.changed_product import changed
 from tests.small_scene import TINY, one_model, problems_of
@@ -289,13 +291,16 @@ def at_rest(grid, initial, seed):
 
 @pytest.mark.mpi(1, 2)
 def test_a_ground_truth_with_too_few_frames_or_without_motion(comm, tmp_path):
-    from eddies.workflows.problems import check_ground_truth
     scene = load_scene(TINY, ["tracers.field_every=5"])
     write_ground_truth(comm, tmp_path, frames=30)
-    check_ground_truth(["train", "simulate"], scene, comm, tmp_path)
+
+    def check(stages, simulation=scene.simulation):
+        check_ground_truth(tmp_path / "ground_truth.h5", stages, simulation, functools.partial(
+            check_frames, stages, scene.tracers, scene.training, simulation, scene.training.window), comm)
+
+    check(["train", "simulate"])
     with pytest.raises(SceneError, match="but there is none from frame 14 of 30 on"):
-        coarse = dataclasses.replace(scene.simulation, frame_interval=0.5)
-        check_ground_truth(["simulate"], dataclasses.replace(scene, simulation=coarse), comm, tmp_path)
+        check(["simulate"], dataclasses.replace(scene.simulation, frame_interval=0.5))
     for group, value, stages, message in (("eddy_turnover_time", 1e12, ["simulate"], "3.8e.12 steps of 0.08"),
                                           ("acceleration_rms", 0.0, ["train"], "scale acceleration = 0.0: must be")):
         comm.Barrier()
@@ -304,4 +309,4 @@ def test_a_ground_truth_with_too_few_frames_or_without_motion(comm, tmp_path):
                 file["reference"].attrs[group] = value
         comm.Barrier()
         with pytest.raises(SceneError, match=message):
-            check_ground_truth(stages, scene, comm, tmp_path)
+            check(stages)

@@ -413,15 +413,14 @@ def check_span(time: Time, span: float, bound: float, tracers: Tracers | None = 
         raise SceneError(problem)
 
 
-def check_ground_truth(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path) -> None:
-    """Raise SceneError if the ground truth of a run directory has too few frames for the stages or a scale of 0, or if
-    the rollout would take too many steps; all ranks call it."""
-    path = directory / STAGES["dns"].file
+def check_ground_truth(path: Path, stages: Sequence[str], simulation: Simulation | None,
+                       check: Callable[[int], None], comm: Comm) -> None:
+    """Raise SceneError if a ground truth does not serve `stages`: `check` finds too few frames, a scale is 0, or the
+    rollout would take too many steps; all ranks call it."""
     with open_product(comm, path, "ground_truth") as file:
         if "particles" not in file:  # measured tracks, none of them in all frames; only fields are made
             return
-        check_frames(stages, scene.tracers, scene.own_training, scene.simulation, scene.seen_in(directory),
-                     len(Trajectory(file, "tracers").times))
+        check(len(Trajectory(file, "tracers").times))
         if {"train", "simulate"} & {*stages}:
             from eddies.workflows.ground_truth.truth import GroundTruth  # imports torch
             truth = GroundTruth(file, comm)
@@ -430,5 +429,5 @@ def check_ground_truth(stages: Sequence[str], scene: Scene, comm: Comm, director
             except ScaleError as error:
                 raise SceneError(f"{path}: {error}") from None
             turnover_time = truth.reference["eddy_turnover_time"]
-            for problem in _too_many_rollout_steps(scene.simulation, turnover_time) if "simulate" in stages else ():
-                raise SceneError(f"{scene.name}: {problem}")
+            for problem in _too_many_rollout_steps(simulation, turnover_time) if "simulate" in stages else ():
+                raise SceneError(f"{path}: {problem}")
