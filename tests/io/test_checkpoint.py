@@ -74,13 +74,16 @@ def test_the_newest_three_are_kept(comm, tmp_path):
 
 @pytest.mark.mpi(1, 2)
 def test_which_checkpoints_are_used(comm, tmp_path, caplog, monkeypatch):
-    """Checkpoints of other kernels are used with a warning. Leftovers, and those of other settings and versions, are
-    removed."""
+    """Checkpoints of other kernels are used with a warning. Leftovers, other names, and those of other settings and
+    versions are removed."""
     directory = fill(comm, tmp_path, [1])
     if comm.rank == 0:
         (directory.path / "step-00000002.h5.partial").write_bytes(b"half")
         (directory.path / "frames-00000001.h5").write_bytes(b"later than the checkpoint")
         (directory.path / "step-00000003").mkdir()  # as of version 1
+        shutil.copy(directory.path / "step-00000001.h5", directory.path / "step-00000010-backup")
+        for name in ("step-00000011.h5", "step-00000012-backup", "step-last"):
+            (directory.path / name).mkdir()
         assert checkpoints_in(directory.path) == [(3, ""), (1, "settings")]
     comm.Barrier()
     with monkeypatch.context() as patch:
@@ -99,18 +102,6 @@ def test_which_checkpoints_are_used(comm, tmp_path, caplog, monkeypatch):
     monkeypatch.undo()
     assert directory.newest() is None
     assert comm.rank > 0 or "step-00000001.h5: was made by another version" in caplog.text
-
-
-@pytest.mark.mpi(1, 2)
-def test_other_names_are_no_checkpoints(comm, tmp_path):
-    directory = fill(comm, tmp_path, [1])
-    if comm.rank == 0:
-        shutil.copy(directory.path / "step-00000001.h5", directory.path / "step-00000010-backup")
-        for name in ("step-00000011.h5", "step-00000012-backup", "step-last"):
-            (directory.path / name).mkdir()
-        assert checkpoints_in(directory.path) == [(1, "settings")]
-    comm.Barrier()
-    assert directory.newest().content["step"] == 1
 
 
 @pytest.mark.mpi(1, 2)
