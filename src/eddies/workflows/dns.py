@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene, SceneError
-from eddies.scene.sections import Forcing, SpinUp
+from eddies.scene.sections import Forcing, SpinUp, Time
 from eddies.time_stepping import STEPPERS
 from eddies.workflows.ground_truth.flow_run import FlowRun, TracerRun, frame_layout, series_of
 from eddies.workflows.ground_truth.frame_counts import unfiltered_frames
@@ -35,9 +35,6 @@ from eddies.workflows.problems import check_span
 from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, stage_fingerprint, stage_provenance
 
 log = logging.getLogger("eddies")
-
-# Function of a time span and the largest step. It raises SceneError if the span takes too many such steps.
-SpanCheck = Callable[[float, float], None]
 
 
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
@@ -76,61 +73,48 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     if same_course and saved is not None and scene.tracers is not None:
         provenance["id"] = origin["id"]  # its frames stay, so products made from them stay valid
     sets = scene.tracer_sets
-    with holding(comm, [directory / name for name in sets]), create_product(
-            comm, product, "ground_truth", provenance) as file:
+    with ExitStack() as held:
+        for name in sets:
+            held.enter_context(lock_directory(comm, directory / name))
+        file = held.enter_context(create_product(comm, product, "ground_truth", provenance))
         if saved is None:
             flow.history.sample(flow.state, flow.clock)
         if flow.phase == "spin-up":
-            spin_up(flow, scene.spin_up.turnovers, partial(check_span, scene.time))
-        if scene.tracers is not None:
+            spin_up(flow, scene.spin_up.turnovers, scene.time)
+        if scene.tracers is None:
+            run_for(flow, scene.time)
+        else:
             if flow.phase != "tracers":
                 saved = None
                 span = scene.tracers.turnovers * flow.history.sample(flow.state, flow.clock)["eddy_turnover_time"]
                 check_span(scene.time, span, flow.step_limit.bound(flow.state, flow.clock), scene.tracers)
             layout = frame_layout(scene.tracers, fluid.compressible, fluid.grid.cutoff)
             before = () if saved is None else saved.files or [f"../{product.name}"]
-            with FrameSegments(comm, guard.checkpoints.path, layout, before) as parts:
-                whole = partial(unfiltered_frames, scene.simulation, scene.training, scene.tracers.field_every)
-                tracers = TracerRun(flow, parts, scene.tracers, scene.seed, whole, saved)
-                if tracers.interval > tracers.intervals:
-                    raise too_late(guard, f"[tracers] turnovers = {scene.tracers.turnovers:g}")
-                tracers.follow()
-                final = flow.state_dict()
-                last = flow.history.sample(flow.state, flow.clock)
-                for name, own in sets.items():
-                    path = directory / name / product.name
-                    if in_files(comm, path, partial(product_fingerprint, path)) == stage_fingerprint(own, "dns"):
-                        continue  # products made from it stay valid
-                    in_files(comm, path, partial(prepare_set, path.parent, own.to_toml()))
-                    with create_product(comm, path, "ground_truth", stage_provenance(own, "dns")) as part:
-                        write_tracers(part, tracers, name, parts, own.forcing)
-                        write_flow(part, flow, scales_of(tracers.released) | tracers.scales(name), own.spin_up)
-                if not sets:
-                    write_tracers(file, tracers, "", parts, scene.forcing)
-                    scales = scales_of(tracers.released) | tracers.scales("")
-            if sets:
-                write_final_fields(file, flow)
-                scales = scales_of(last)
-        else:
-            if flow.phase == "run" and flow.clock.time > flow.began + scene.time.duration * (1 + 1e-9):
-                raise too_late(guard, f"[time] duration = {scene.time.duration:g}")
-            run_for(flow, scene.time.duration, partial(check_span, scene.time))
-            final = flow.state_dict()
+            parts = held.enter_context(FrameSegments(comm, guard.checkpoints.path, layout, before))
+            whole = partial(unfiltered_frames, scene.simulation, scene.training, scene.tracers.field_every)
+            tracers = TracerRun(flow, parts, scene.tracers, scene.seed, whole, saved)
+            if tracers.interval > tracers.intervals:
+                raise too_late(guard, f"[tracers] turnovers = {scene.tracers.turnovers:g}")
+            tracers.follow()
+        final, last = flow.state_dict(), flow.history.sample(flow.state, flow.clock)
+        for name, own in sets.items():
+            path = directory / name / product.name
+            if in_files(comm, path, partial(product_fingerprint, path)) == stage_fingerprint(own, "dns"):
+                continue  # products made from it stay valid
+            in_files(comm, path, partial(prepare_set, path.parent, own.to_toml()))
+            with create_product(comm, path, "ground_truth", stage_provenance(own, "dns")) as part:
+                write_tracers(part, tracers, name, parts, own.forcing)
+                write_flow(part, flow, scales_of(tracers.released) | tracers.scales(name), own.spin_up)
+        if scene.tracers is None or sets:
             write_final_fields(file, flow)
-            scales = scales_of(flow.history.sample(flow.state, flow.clock))
+            scales = scales_of(last)
+        else:
+            write_tracers(file, tracers, "", parts, scene.forcing)
+            scales = scales_of(tracers.released) | tracers.scales("")
         write_flow(file, flow, scales, scene.spin_up)
     guard.checkpoints.remove()
     if not sets:
         guard.checkpoints.write(flow.steps, final)
-
-
-@contextmanager
-def holding(comm: Comm, directories: Sequence[Path]) -> Iterator[None]:
-    """Lock the run directories of the sets of tracers, and make those that are missing; collective."""
-    with ExitStack() as locks:
-        for directory in directories:
-            locks.enter_context(lock_directory(comm, directory))
-        yield
 
 
 def prepare_set(directory: Path, text: str) -> None:
@@ -171,18 +155,23 @@ def too_late(guard: Guard, key: str) -> SceneError:
                       "key, or remove that directory to simulate from the beginning")
 
 
-def run_for(flow: FlowRun, duration: float, check: SpanCheck) -> None:
-    """Run the flow for a duration after its start or spin-up. Raises SceneError if that takes too many steps."""
-    clock = flow.clock
+def run_for(flow: FlowRun, time: Time) -> None:
+    """Run the flow for a duration after its start or spin-up.
+
+    Raises SceneError if that takes too many steps, or if the flow has already passed the end.
+    """
+    clock, duration = flow.clock, time.duration
     if flow.phase == "start":
-        check(duration, flow.step_limit.bound(flow.state, clock))
+        check_span(time, duration, flow.step_limit.bound(flow.state, clock))
         flow.began, flow.phase = clock.time, "run"
+    elif clock.time > flow.began + duration * (1 + 1e-9):
+        raise too_late(flow.guard, f"[time] duration = {duration:g}")
     start, clock.end = flow.began, flow.began + duration
     progress = ProgressLine("dns", flow.history.describe, done=(clock.time - start) / duration)
     flow.advance([flow.history, lambda _, clock: progress((clock.time - start) / duration, clock.steps)])
 
 
-def spin_up(flow: FlowRun, turnovers: float, check: SpanCheck) -> None:
+def spin_up(flow: FlowRun, turnovers: float, time: Time) -> None:
     """Run the flow for a number of eddy turnovers.
 
     Raises SceneError if that takes too many steps, as in a flow without forcing that comes to rest.
@@ -197,7 +186,7 @@ def spin_up(flow: FlowRun, turnovers: float, check: SpanCheck) -> None:
             clock.stop()
         elif flow.fluid.forcing is None:
             last = history.rows[-1]
-            check((1 - done) * turnovers * last["eddy_turnover_time"], last["time_step"] or np.inf)
+            check_span(time, (1 - done) * turnovers * last["eddy_turnover_time"], last["time_step"] or np.inf)
 
     flow.advance([history, until_turned_over])
     flow.clock.end, flow.phase = np.inf, "start"  # the next phase sets the end
