@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,10 +44,9 @@ def run(run_directory: Path, output: Path, comm: Comm, layout: str = "vtkhdf") -
 
 def _export(run_directory: Path, output: Path, alone: Comm, layout: str) -> None:
     written = 0
-    for kind, opened in (("ground_truth", partial(_stored, "ground_truth")),
-                         ("reconstruction", partial(_stored, "reconstruction")), ("rollout", _rollout)):
+    for kind in PRODUCTS:
         if (run_directory / f"{kind}.h5").exists():
-            with opened(run_directory, alone) as (series, provenance):
+            with _opened(kind, run_directory, alone) as (series, provenance):
                 for group, name in ((group, name) for group in series for name in series[group]):
                     case = f"{kind}-{group}-{name}"
                     written += _write(output, case, group, series[group][name], provenance, layout == "lagrangebench")
@@ -60,19 +58,16 @@ def _export(run_directory: Path, output: Path, alone: Comm, layout: str) -> None
 
 
 @contextmanager
-def _stored(kind: str, run_directory: Path, alone: Comm) -> Iterator[tuple[Series, Provenance]]:
-    """Open the fields and particles that a product stores."""
-    with open_product(alone, run_directory / f"{kind}.h5", kind) as file:
-        yield {group: {name: reader(file, name) for name in file.get(group, ())}
-               for group, reader in (("fields", FieldSeries), ("particles", Trajectory))}, read_provenance(file)
-
-
-@contextmanager
-def _rollout(run_directory: Path, alone: Comm) -> Iterator[tuple[Series, Provenance]]:
-    """Open all series of the rollout, stored or computed."""
-    from eddies.workflows.rollout.measured import open_rollout  # needs torch
-    with open_rollout(run_directory, alone) as measured:
-        yield measured.exported, measured.provenance
+def _opened(kind: str, run_directory: Path, alone: Comm) -> Iterator[tuple[Series, Provenance]]:
+    """Open the fields and particles that a product stores, and those that are computed of a rollout."""
+    if kind == "rollout":
+        from eddies.workflows.rollout.measured import open_rollout  # needs torch
+        with open_rollout(run_directory, alone) as measured:
+            yield measured.exported, measured.provenance
+    else:
+        with open_product(alone, run_directory / f"{kind}.h5", kind) as file:
+            yield {group: {name: reader(file, name) for name in file.get(group, ())}
+                   for group, reader in (("fields", FieldSeries), ("particles", Trajectory))}, read_provenance(file)
 
 
 def _cube_of(series: Any) -> tuple[float, np.ndarray]:
