@@ -634,10 +634,6 @@ class Eulerian(Section):
         """Whether the fluid has a variable density and sound waves."""
         return self.fluid == "compressible"
 
-    def filter_passed(self, filter_width: float) -> float:
-        """Filter width of the velocity in the equations: the given one, or 0 if the equations are unfiltered."""
-        return filter_width if self.equations == "filtered" else 0.0
-
     def cells_for(self, filter_width: float) -> int:
         """Cells along each side: as given, or the fewest whose Nyquist wavenumber reaches pi / filter width."""
         if self.cells is not None:

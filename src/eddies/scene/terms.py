@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from eddies.errors import UserError
+from eddies.scene import sections
 from eddies.scene.integrators import Scheme
 from eddies.scene.values import Section, boolean, choice, integer, integers, named, number, texts
 
@@ -227,11 +228,8 @@ class Relaxation(TermSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Forcing(TermSettings):
-    """Linear forcing of the large scales at a prescribed power."""
-
-    injection_rate: float = number("power injected per unit mass of the unfiltered flow", at_least=0)
-    wavenumber: float = number("limit of the forced modes, 0 < |k| < wavenumber", default=2.0, above=1)
+class Forcing(sections.Forcing, TermSettings):
+    """Linear forcing of the large scales at a prescribed power of the unfiltered flow."""
 
     reads = ("resolved",)
 

@@ -52,7 +52,7 @@ class EulerianRun:
         cells = self.settings.cells_for(width)
         grid = SpectralGrid(SlabDecomposition(comm, length, cells), scene.simulation.precision)
         # Widths of two filters: one that the fluid's velocity has passed, and one still to apply for the particles.
-        filter_passed = self.settings.filter_passed(width)
+        filter_passed = width if self.settings.equations == "filtered" else 0.0
         filter_left = 0.0 if filter_passed else width
         forcing = None
         if (forced := forcing_of(scene.simulation.injection, scene.forcing, truth)) is not None:
