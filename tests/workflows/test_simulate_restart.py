@@ -3,7 +3,6 @@
 import shutil
 from dataclasses import replace
 
-import h5py
 import numpy as np
 import pytest
 
@@ -11,6 +10,7 @@ from eddies.io.checkpoint import Checkpoint
 from eddies.parallel.stop import Stopped
 from eddies.scene.scene import BOX_LENGTH, Eulerian, Model
 from eddies.workflows import simulate
+from tests.workflows.contents import assert_same, numbers_in
 from tests.workflows.small_rollout import OWN_METHOD, prepared, scales_of, with_method, write_model
 from tests.workflows.stopping import StopAtStep
 
@@ -44,9 +44,7 @@ def products(comm, shared_folder):
     scene = prepared(comm, folder / "run", side=9, overrides=["tracers.field_cells=12"])  # enough for three slabs
     scales = scales_of(comm, folder / "run")
     for name, model in MODELS.items():
-        if comm.rank == 0:
-            (folder / name).mkdir()
-        comm.Barrier()
+        (folder / name).mkdir(exist_ok=True)
         write_model(comm, folder / name, replace(scene, model=model), scales, 0.5, FEATURES[name])
     return folder, scene
 
@@ -67,22 +65,7 @@ def case_of(products, linked):
 
 
 def product(comm, directory):
-    """All numbers of a rollout that another run must repeat: datasets, and attributes but for wall times."""
-    comm.Barrier()
-    found = {}
-    with h5py.File(directory / "rollout.h5") as file:
-        file.visititems(lambda name, item: found.update({name: item[()]} if isinstance(item, h5py.Dataset) else {}))
-        found["frames at steps"] = file["particles/model/step"][()]  # of which there are several links
-        found |= {name: value for name, value in file["rollout"].attrs.items()
-                  if "seconds" not in name and name != "storing_share"}
-    comm.Barrier()
-    return found
-
-
-def assert_same(found, expected, place):
-    assert found.keys() == expected.keys()
-    for name, values in expected.items():
-        assert np.array_equal(found[name], values), (place, name)
+    return numbers_in(comm, directory / "rollout.h5")
 
 
 def check_splits(comm, scene, directory, monkeypatch, each=1):
@@ -93,8 +76,8 @@ def check_splits(comm, scene, directory, monkeypatch, each=1):
         patch.setattr("eddies.io.checkpoint.CheckpointDirectory.remove", lambda self: None)
         simulate.run(scene, comm, directory, StopAtStep(comm, every_step=True))
     whole, saved, checkpoints = product(comm, directory), directory / "saved", directory / "checkpoints-rollout"
-    steps, at_frames = int(whole["steps"]), sorted(set(whole["frames at steps"].tolist()))
-    assert whole["status"] == "complete" and len(at_frames) >= 2
+    steps, at_frames = int(whole["rollout/steps"]), sorted(set(whole["particles/model/position/step"].tolist()))
+    assert whole["rollout/status"] == "complete" and len(at_frames) >= 2
     if comm.rank == 0:
         checkpoints.rename(saved)
     comm.Barrier()
@@ -164,7 +147,7 @@ def test_another_number_of_ranks_goes_on_to_rounding(comm, case_of, name, before
         simulate.run(scene, groups[after], directory)
         other = product(groups[after], directory)
     if comm.rank == 0:
-        assert other["steps"] == whole["steps"]
+        assert other["rollout/steps"] == whole["rollout/steps"]
         for column in ("position", "velocity", "acceleration"):
             values = whole[f"particles/model/{column}/value"]
             difference = other[f"particles/model/{column}/value"] - values
@@ -184,7 +167,7 @@ def test_a_method_without_a_state_begins_again(comm, small_products, linked, own
     with pytest.raises(Stopped, match="after the last finished stage"):
         simulate.run(scene, comm, directory, StopAtStep(comm, 1))
     simulate.run(scene, comm, directory)
-    assert product(comm, directory)["status"] == "complete"
+    assert product(comm, directory)["rollout/status"] == "complete"
     assert not (directory / "checkpoints-rollout").exists()
 
 

@@ -15,6 +15,7 @@ from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import dns, train, train_kernel
 from eddies.workflows.run_directory.work import stage_seconds
 from tests.small_scene import TINY
+from tests.workflows.contents import assert_same, numbers_in
 from tests.workflows.stopping import StopAtStep
 
 # Ten frame intervals, all for training. Six steps on single frames, two of them with all losses; then two steps through
@@ -38,30 +39,15 @@ def products(comm, shared_folder):
     return scene, folder
 
 
-def datasets(comm, path):
-    """All datasets of a product but wall times, by name."""
-    comm.Barrier()
-    found = {}
-    with h5py.File(path) as file:
-        file.visititems(lambda name, item: found.update({name: item[()]} if isinstance(item, h5py.Dataset) else {}))
-    comm.Barrier()
-    seconds = found.pop("history/seconds", None)
-    assert path.name == "kernel.h5" if seconds is None else np.all(np.diff(seconds) > 0)
-    return found
-
-
 def check_same_after_stops(comm, run, scene, directory, product, stops):
     """Stop a training at some steps, then let it end: the product is the one that was never stopped."""
     run(scene, comm, directory)
-    whole, others = datasets(comm, directory / product), {path.name for path in directory.iterdir()}
+    whole, others = numbers_in(comm, directory / product), {path.name for path in directory.iterdir()}
     for before, step in pairwise((0, *stops)):
         with pytest.raises(Stopped, match=f"from step {step} of the training"):
             run(scene, comm, directory, StopAtStep(comm, step - before))
     run(scene, comm, directory)
-    parts = datasets(comm, directory / product)
-    assert parts.keys() == whole.keys()
-    for name, values in parts.items():
-        assert np.array_equal(values, whole[name], equal_nan=values.dtype.kind == "f"), name
+    assert_same(numbers_in(comm, directory / product), whole)
     assert {path.name for path in directory.iterdir()} == others
     return whole
 
@@ -73,6 +59,8 @@ def test_a_stopped_training_is_the_one_never_stopped(comm, products, linked):
     directory = linked(folder)
     whole = check_same_after_stops(comm, train.run, scene, directory, "model.h5", (3, 6, 8))
     assert np.array_equal(whole["history/phase"], [0] * 4 + [1] * 2 + [2] * 2 + [3] * 2)
+    with h5py.File(directory / "model.h5") as file:
+        assert np.all(np.diff(file["history/seconds"][()]) > 0)
     assert (directory / "learning.png").read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
 
 

@@ -1,0 +1,29 @@
+"""The numbers of a product, which another run must repeat."""
+
+import h5py
+import numpy as np
+
+
+def numbers_in(comm, path):
+    """All datasets and attributes below the root of a product, by path, except wall times."""
+    comm.Barrier()
+    with h5py.File(path) as file:
+        found = {name: value for key, item in file.items() for name, value in below(item, key)}
+    comm.Barrier()
+    return {name: value for name, value in found.items() if "seconds" not in name and "storing_share" not in name}
+
+
+def below(item, name):
+    """Yield path and value of a dataset, or of all attributes and datasets of a group."""
+    if isinstance(item, h5py.Dataset):
+        yield name, item[()]
+        return
+    yield from ((f"{name}/{key}", value) for key, value in item.attrs.items())
+    for key, part in item.items():
+        yield from below(part, f"{name}/{key}")
+
+
+def assert_same(found, expected, place=""):
+    assert found.keys() == expected.keys()
+    for name, values in expected.items():
+        assert np.array_equal(found[name], values, equal_nan=np.asarray(values).dtype.kind == "f"), (place, name)
