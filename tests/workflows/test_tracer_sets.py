@@ -16,7 +16,7 @@ from eddies.workflows import dns, timing
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import find_work
 from eddies.workflows.status import status_lines
-from eddies.workflows.variant_rows import with_another_kernel
+from eddies.workflows.variant_rows import rows_of
 from eddies.workflows.variants import steps
 from tests.small_scene import TINY, problems_of
 from tests.workflows.contents import assert_same
@@ -97,7 +97,7 @@ def test_realisations_of_sets_alone_are_ground_truths(tmp_path):
 def test_variants_of_one_set_are_measured_alike(tmp_path):
     keys = [*SPLIT, *SETS, "tracers.other.particles_per_side=4"]
     alike, apart = (load_scene(with_variants(tmp_path, a="few", b=other), keys) for other in ("few", "other"))
-    assert with_another_kernel(alike) == [] and with_another_kernel(apart) == ["b"]
+    assert rows_of(alike, {}, {}, None)[1] == [] and rows_of(apart, {}, {}, None)[1] == ["b"]
 
 
 @pytest.mark.mpi(1)

@@ -10,8 +10,7 @@ from eddies.io.weights import save_weights
 from eddies.measures import MEASURES
 from eddies.scene.scene import load_scene
 from eddies.workflows.variant_rows import (BEFORE, BREAK_EVEN, SEARCH, THROUGH_KERNEL, add_break_even, before, combined,
-                                           leave_out_kernel, missing_reason, notes, row, simulation_seconds, step_costs,
-                                           with_another_kernel)
+                                           missing_reason, notes, rows_of, simulation_seconds, step_costs)
 from tests.small_scene import TINY
 
 HEAD = f'base = "{TINY}"\nsimulation.turnovers = 0.25\nkernel.steps = 50\n'
@@ -46,19 +45,17 @@ def test_one_realisation_that_stops_leaves_no_number():
 @pytest.mark.parametrize("change", ["kernel.neighbors = 40", "kernel.steps = 60"])
 def test_numbers_of_another_kernel_are_left_out(tmp_path, change):
     scene = scene_of(tmp_path, ("smaller", "model.pairs.hidden = [8]", "simulation.step = 0.05"), ("own", change))
-    rows = [row(scene, name, [tmp_path], [REALISED], None) for name in scene.variant]
-    another = with_another_kernel(scene)
-    assert another == ["own"]
-    leave_out_kernel(rows, another)
-    assert [{measure for measure in MEASURES if found[measure] is None} for found in rows] == [
+    rows, different = rows_of(scene, dict.fromkeys(scene.variant, [tmp_path]),
+                              dict.fromkeys(scene.variant, [REALISED]), None)
+    assert [{measure for measure in MEASURES if row[measure] is None} for row in rows] == [
         set(), set(), set(THROUGH_KERNEL)]
-    _, note = notes((), another, {}, {})
+    _, note = notes((), different, {}, {})
     assert note.startswith("own: no ") and all(MEASURES[name] in note for name in THROUGH_KERNEL)
 
 
 def test_a_variant_without_a_rollout_says_why(tmp_path):
-    scene = scene_of(tmp_path)
-    assert row(scene, "plain", [tmp_path], [], None)["status"] == "not run"
+    ((row,), _) = rows_of(scene_of(tmp_path), {"plain": [tmp_path]}, {}, None)
+    assert row["status"] == "not run"
     (tmp_path / "failure.txt").write_text("too few slabs\n")
     assert missing_reason(tmp_path) == missing_reason(tmp_path / "realisation-2") == "failed: too few slabs"
 

@@ -41,8 +41,8 @@ from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.workflows.problems import directory_problems
 from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite
 from eddies.workflows.run_directory.work import read_stage_seconds
-from eddies.workflows.variant_rows import (COLUMNS, ROLLOUT, add_break_even, leave_out_kernel, machine, notes,
-                                           numbers, row, simulation_seconds, with_another_kernel)
+from eddies.workflows.variant_rows import (COLUMNS, ROLLOUT, add_break_even, machine, notes, numbers, rows_of,
+                                           simulation_seconds)
 from eddies.workflows.variants import rollouts
 
 if TYPE_CHECKING:
@@ -180,8 +180,9 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: S
         for name, where in report.pages.items():
             if where != directory:
                 log.info("report: variant %s: %s", name, report.report_of(where) / "index.html")
-        in_files(comm, report.report_of(directory),
-                 lambda: _write_main(scene, report, made[report.main], found, comm.size, alone))
+        text = scene.to_toml() if scene is not None and scene.variant else ""
+        in_files(comm, report.report_of(directory), lambda: _write_main(
+            report, made[report.main], *_compare(scene, report, made[report.main], found, comm.size, alone), text))
     finally:
         alone.Free()
 
@@ -422,9 +423,8 @@ def _compare(scene: Scene | None, report: Report, page: Page, found: Mapping[str
     """
     if not report.main:
         return [], {}
-    variants, another = scene.variant or {scene.name: scene}, with_another_kernel(scene)
-    rows = [row(scene, name, runs, found.get(name, ()), alone) for name, runs in report.runs.items()]
-    leave_out_kernel(rows, another)
+    variants = scene.variant or {scene.name: scene}
+    rows, another = rows_of(scene, report.runs, found, alone)
     repeating = [name for name, each in variants.items() if each.coarse_cells == each.flow.cells]
     simulation = simulation_seconds(rows, repeating, page.simulation_seconds)
     add_break_even(rows, simulation)
@@ -443,14 +443,13 @@ def _compare(scene: Scene | None, report: Report, page: Page, found: Mapping[str
         "variants.csv": lines.getvalue(), "variants.json": json.dumps(record, indent=2, allow_nan=False) + "\n"}
 
 
-def _write_main(scene: Scene | None, report: Report, page: Page, found: Mapping[str, Sequence[Row]], ranks: int,
-                alone: Comm) -> None:
-    """Write the main page, with the table of variants if there is one, and log its numbers; one rank calls it."""
-    first, beside = _compare(scene, report, page, found, ranks, alone)
+def _write_main(report: Report, page: Page, first: Sequence[Section], beside: Mapping[str, str], text: str) -> None:
+    """Write the main page, which begins with the sections `first`, and log its numbers; one rank calls it. `beside` and
+    `text` as for `_write`."""
     _draw(first)
     page.sections = [*first, *page.sections]
     page.seconds = {**read_stage_seconds(report.directory), **page.seconds}
-    _write(report, page, report.directory, beside, scene.to_toml() if scene is not None and scene.variant else "")
+    _write(report, page, report.directory, beside, text)
     for section in page.sections:
         count = len(section.illustrations)
         log.info("report: %s%s", section.title, f" ({count} figure{'s' if count > 1 else ''})" if count else "")
@@ -464,9 +463,9 @@ def _write_main(scene: Scene | None, report: Report, page: Page, found: Mapping[
 
 
 def _write(report: Report, page: Page, directory: Path, beside: Mapping[str, str] | None = None,
-           scene: str = "") -> None:
-    """Write a page about a run directory, its numbers, and the texts `beside` by file name. `scene` is the text of the
-    scene for a page about all variants; without it, the page shows the scene of the last product."""
+           text: str = "") -> None:
+    """Write a page about a run directory, its numbers, and the texts `beside` by file name. `text` is the scene as TOML
+    for a page about all variants; without it, the page shows the scene of the last product."""
     rows = [("stage", "ranks", "wall time (s)", "date", "eddies", "commit", "libraries")]
     for kind, origin in page.provenance.items():
         stage = MAKER_OF[kind].name
@@ -474,7 +473,7 @@ def _write(report: Report, page: Page, directory: Path, beside: Mapping[str, str
                      shown(page.seconds[stage]) if stage in page.seconds else "not stored", origin["date"],
                      origin["eddies"], origin["commit"][:12] if origin["commit"] else "not a checkout",
                      ", ".join(f"{name} {version}" for name, version in origin["libraries"].items())))
-    text = scene or list(page.provenance.values())[-1]["scene"]
+    text = text or list(page.provenance.values())[-1]["scene"]
     title = tomllib.loads(text).get("title", "untitled scene")
     record = RunRecord(directory.resolve().name, title, text, rows, page.warnings, report.links(directory))
     write_page(report.report_of(directory), record, page.sections, beside or {})

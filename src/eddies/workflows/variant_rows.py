@@ -42,26 +42,37 @@ COLUMNS = ("name", "label", "method", "kind", "on_grid", "status", "stopped_at",
 MODEL, ROLLOUT = STAGES["train"].file, STAGES["simulate"].file
 
 
-def row(scene: Scene, name: str, directories: Sequence[Path], realised: Sequence[Mapping[str, Any]],
-        alone: Comm) -> dict[str, Any]:
-    """Return the row of a variant, or of a scene without variants, with the keys COLUMNS; a missing number is None.
+def rows_of(scene: Scene, runs: Mapping[str, Sequence[Path]], measured: Mapping[str, Sequence[Mapping[str, Any]]],
+            alone: Comm) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the rows of the variants, or of a scene without variants, with the keys COLUMNS; a missing number is None.
+    Return also the names of variants whose kernel differs from that of the scene or, with sets of tracers, of the first
+    variant. Their numbers of THROUGH_KERNEL cannot be compared with those of the others, and are left out.
 
-    directories: of the variant's rollouts. realised: `numbers` of each of them; empty if one is missing. Times are in
-    turnovers T, and `wall_seconds` and `core_seconds` are per turnover.
+    runs: directories of each variant's rollouts. measured: `numbers` of all rollouts of a variant; missing if one of
+    them is missing. Times are in turnovers T, and `wall_seconds` and `core_seconds` are per turnover.
     """
-    variant = scene.variant.get(name, scene)
-    found: dict[str, Any] = dict.fromkeys(COLUMNS)
-    found |= {"name": name, "label": variant.label or name, "method": variant.simulation.method,
-              "kind": variant.simulation.title, "on_grid": variant.simulation.on_grid,
-              "settings": "; ".join(scene.differences(name)) if scene.variant else ""}
-    if realised:
-        found |= combined(realised)
-        first = directories[0]
-        step = step_path(variant.simulation, first.parent if scene.realisations else first)
-        found |= before(first / MODEL if variant.needs_model else None, step, alone)
-    else:
-        found["status"] = missing_reason(next(each for each in directories if not (each / ROLLOUT).exists()))
-    return {key: finite(value) for key, value in found.items()}
+    kernel_of = partial(stage_fingerprint, stage="train-kernel")
+    kernels = {name: kernel_of(variant) for name, variant in scene.variant.items()}
+    common = next(iter(kernels.values())) if scene.sets else kernel_of(scene.without_variants)
+    different = [name for name, kernel in kernels.items() if kernel != common]
+    rows = []
+    for name, directories in runs.items():
+        variant, first = scene.variant.get(name, scene), directories[0]
+        simulation = variant.simulation
+        found: dict[str, Any] = dict.fromkeys(COLUMNS)
+        found |= {"name": name, "label": variant.label or name, "method": simulation.method, "kind": simulation.title,
+                  "on_grid": simulation.on_grid,
+                  "settings": "; ".join(scene.differences(name)) if scene.variant else ""}
+        if name in measured:
+            step = step_path(simulation, first.parent if scene.realisations else first)
+            found |= combined(measured[name])
+            found |= before(first / MODEL if variant.needs_model else None, step, alone)
+        else:
+            found["status"] = missing_reason(next(each for each in directories if not (each / ROLLOUT).exists()))
+        if name in different:
+            found |= dict.fromkeys(THROUGH_KERNEL)
+        rows.append({key: finite(value) for key, value in found.items()})
+    return rows, different
 
 
 def missing_reason(directory: Path) -> str:
@@ -101,22 +112,6 @@ def simulation_seconds(rows: Sequence[Mapping[str, Any]], repeating: Collection[
     `of_truth`, the time of the ground truth."""
     repeated = [row["wall_seconds"] for row in rows if row["wall_seconds"] is not None and row["name"] in repeating]
     return min(repeated, default=of_truth)
-
-
-def with_another_kernel(scene: Scene) -> list[str]:
-    """Return the variants whose kernel differs from that of the scene or, with sets of tracers, of the first variant.
-    Their numbers of THROUGH_KERNEL cannot be compared with those of the others."""
-    kernel_of = partial(stage_fingerprint, stage="train-kernel")
-    kernels = {name: kernel_of(variant) for name, variant in scene.variant.items()}
-    common = next(iter(kernels.values())) if scene.sets else kernel_of(scene.without_variants)
-    return [name for name, kernel in kernels.items() if kernel != common]
-
-
-def leave_out_kernel(rows: Sequence[dict[str, Any]], names: Collection[str]) -> None:
-    """Leave out the numbers of THROUGH_KERNEL in the rows of the variants `names`."""
-    for row in rows:
-        if row["name"] in names:
-            row |= dict.fromkeys(THROUGH_KERNEL)
 
 
 def add_break_even(rows: Sequence[dict[str, Any]], simulation: float | None) -> None:
