@@ -74,10 +74,8 @@ class NeighborList:
             subtracted before the conversion, so the size of the box costs no accuracy in single precision.
         """
         dtype, total = dtype or receivers.dtype, len(self.offsets) - 1
-        if rows is None or isinstance(rows, slice):
-            numbers = torch.arange(total, device=receivers.device)[rows or slice(None)]
-        else:
-            numbers = rows
+        numbers = (rows if isinstance(rows, Tensor) else
+                   torch.arange(total, device=receivers.device)[rows or slice(None)])
         recorded = torch.is_grad_enabled() and (receivers.requires_grad or senders.requires_grad)
         if kernels_serve(receivers.device) and not recorded:
             return self._compiled_pairs(receivers, senders, numbers, dtype)
