@@ -27,6 +27,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from eddies.import_path import is_path
 from eddies.io.hdf5 import create_product, write_table
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import IdOrder
@@ -38,7 +39,7 @@ from eddies.scene.integrators import MOST_COURANT, SCHEMES
 from eddies.scene.scene import Scene, SceneError, Simulation
 from eddies.time_stepping import ETDRK4
 from eddies.workflows.ground_truth.truth import GroundTruth, open_truth
-from eddies.workflows.rollout.method import METHODS, Method, TimeStep, make_method
+from eddies.workflows.rollout.method import Method, TimeStep, make_method
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 
 log = logging.getLogger("eddies")
@@ -248,7 +249,7 @@ def integrators(settings: Simulation, span: float) -> Iterator[tuple[str, float,
         yield "etdrk4", MOST_COURANT, ETDRK4.evaluations
         return
     # A method of the user ignores the integrator, so one is enough.
-    for name in settings.schemes if settings.method in METHODS else settings.schemes[:1]:
+    for name in settings.schemes[:1] if is_path(settings.method) else settings.schemes:
         scheme = SCHEMES[name]
         yield name, span if scheme.dense else settings.frame_interval, scheme.evaluations
 

@@ -20,9 +20,8 @@ from eddies.scene.scene import Scene
 from eddies.workflows.ground_truth.frame_counts import rollout_start
 from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.rollout.course import Course, frame_layout
-from eddies.workflows.rollout.method import TimeStep, make_method
-from eddies.workflows.rollout.particle_run import forcing_of
-from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
+from eddies.workflows.rollout.method import TimeStep, forcing_of, make_method
+from eddies.workflows.run_directory.fingerprints import stage_provenance
 from eddies.workflows.run_directory.work import read_found_step, step_path
 
 log = logging.getLogger("eddies")
@@ -35,7 +34,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     rollout continues from its newest checkpoint.
     """
     directory, settings, device = Path(directory), scene.simulation, prepare_torch(scene.device, comm)
-    guard = Guard(comm, directory / STAGES["simulate"].checkpoints, stage_fingerprint(scene, "simulate"), stop,
+    provenance = stage_provenance(scene, "simulate")
+    guard = Guard(comm, directory / STAGES["simulate"].checkpoints, provenance["fingerprint"], stop,
                   " of the rollout")
     with open_truth(comm, directory / STAGES["dns"].file, device) as truth, torch.no_grad():
         start = rollout_start(settings, scene.tracers, scene.seen_in(directory), len(truth.times), truth.field_frames)
@@ -53,8 +53,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         with segments:
             course = Course(method, segments, count, settings.frame_interval, guard, saved)
             outcome = course.run()
-            with create_product(comm, directory / STAGES["simulate"].file, "rollout",
-                                stage_provenance(scene, "simulate")) as file:
+            with create_product(comm, directory / STAGES["simulate"].file, "rollout", provenance) as file:
                 segments.assemble(file)
                 file.create_group("rollout").attrs.update({
                     **outcome, **method.description(), "method": settings.method,

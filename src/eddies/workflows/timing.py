@@ -31,10 +31,9 @@ from eddies.scene.scene import Scene, SceneError, Training
 from eddies.workflows import dns, find_step, reconstruct, report, simulate, train, train_kernel
 from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.ground_truth.frame_counts import TESTED_FRAMES
-from eddies.workflows.learned.model import load_form
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.learned.training_data import training_data
-from eddies.workflows.learned.training_phases import horizon_phases, one_step_phases
+from eddies.workflows.learned.training_phases import training_phases
 from eddies.workflows.learned.truths import open_truths
 from eddies.workflows.variants import steps
 
@@ -156,14 +155,12 @@ def rest_of_training(definition: ModelDefinition, few: Training, frames: int, di
     Returns the wall time of this work, the number of steps, and the mean seconds of a step.
     """
     comm, seconds, stepping, number = stop.comm, 0.0, 0.0, 0
-    with open_truths(directory / STAGES["dns"].file, few.truth_files, comm, device) as (truth, trained_on):
-        kernel_file = directory / STAGES["train-kernel"].file
-        kernel = load_form(comm, kernel_file, truth.scales, truth.device).kernel if few.field_weight > 0 else None
+    with open_truths(directory / STAGES["dns"].file, few.truth_files, comm, device) as (_, trained_on):
         data = training_data(definition, few, trained_on)
         parameters = list(data[0].model.parameters())
         each_frame = elapsed(comm, lambda: [each.frames for each in data]) / few.frames
         seconds += each_frame * (frames - few.frames + TESTED_FRAMES)
-        for phase in [*one_step_phases(data, kernel), *horizon_phases(data)] if parameters else ():
+        for phase in training_phases(data, directory / STAGES["train-kernel"].file):
             stop.check()
             optimizer = Adam(comm, parameters, phase.steps, *phase.rates)
             step = min(elapsed(comm, lambda: phase.take(optimizer, index))

@@ -1,14 +1,19 @@
-"""Train the particle model on tracers of the training window, then test it a priori at other times."""
+"""Train the particle model on tracers of the training window, or take the weights of another run; then test the model
+a priori at other times."""
 
 from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+import torch
 
 from eddies.io.checkpoint import Guard
 from eddies.io.provenance import product_provenance
-from eddies.io.weights import save_weights
+from eddies.io.weights import StoredWeights, save_weights
 from eddies.io.new_files import write_files
 from eddies.learning.training import Training
 from eddies.parallel.communicator import Comm
@@ -17,14 +22,14 @@ from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene
 from eddies.workflows.ground_truth.frame_counts import last_seen
-from eddies.workflows.learned import transfer
-from eddies.workflows.learned.a_priori import evaluate, evaluation_frames
-from eddies.workflows.learned.model import load_form
-from eddies.workflows.learned.source import ModelDefinition
+from eddies.workflows.ground_truth.truth import GroundTruth, open_truth
+from eddies.workflows.learned.a_priori import evaluate
+from eddies.workflows.learned.model import trained_model
+from eddies.workflows.learned.source import ModelDefinition, read_source, trained_on
 from eddies.workflows.learned.training_data import model_for, training_data
-from eddies.workflows.learned.training_phases import feature_range, horizon_phases, one_step_phases, take_all_steps
+from eddies.workflows.learned.training_phases import feature_range, take_all_steps, training_phases
 from eddies.workflows.learned.truths import open_truths
-from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
+from eddies.workflows.run_directory.fingerprints import stage_provenance
 
 log = logging.getLogger("eddies")
 
@@ -38,17 +43,16 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     With [model] path the weights of another run are used, without training. A stopped training continues from its
     newest checkpoint.
     """
-    directory = Path(directory)
-    if scene.model.path is not None:
-        transfer.run(scene, comm, directory)
-        return
+    directory, provenance = Path(directory), stage_provenance(scene, "train")
+    own_file, product = directory / STAGES["dns"].file, directory / STAGES["train"].file
     definition, settings, device = ModelDefinition.of(scene), scene.training, prepare_torch(scene.device, comm)
-    own_file = directory / STAGES["dns"].file
-    with open_truths(own_file, settings.truth_files, comm, device) as (truth, trained_on):
-        # Only the field loss averages with the kernel.
-        kernel_file = directory / STAGES["train-kernel"].file
-        kernel = load_form(comm, kernel_file, truth.scales, truth.device).kernel if settings.field_weight > 0 else None
-        data, tests = training_data(definition, settings, trained_on), evaluation_frames(truth)
+    if scene.model.path is not None:
+        source = read_source(scene.name, definition, comm)
+        with open_truth(comm, own_file, device) as truth:
+            take_weights(source, definition, scene.seen_in(directory), provenance, truth, product)
+        return
+    with open_truths(own_file, settings.truth_files, comm, device) as (truth, truths):
+        data = training_data(definition, settings, truths)
         model, dtype = data[0].model, data[0].dtype
         for each in data:
             log.info("train: %d parameters; trains on frames up to %d and keeps the next %d for validation; the "
@@ -58,11 +62,10 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         own = next((each.model for each in data if each.truth is truth), None)
         # If the model is trained only on other ground truths, it has seen no part of this run's ground truth.
         last = last_seen(settings.window if own is not None else 0.0, len(truth.times))
-        guard = Guard(comm, directory / STAGES["train"].checkpoints, stage_fingerprint(scene, "train"), stop,
+        guard = Guard(comm, directory / STAGES["train"].checkpoints, provenance["fingerprint"], stop,
                       " of the training")
         history, cost, curves = {}, [], None
-        learns = next(model.parameters(), None) is not None
-        phases = [*one_step_phases(data, kernel), *horizon_phases(data)] if learns else []
+        phases = training_phases(data, directory / STAGES["train-kernel"].file)
         if not phases:
             log.info("train: no training, because the terms have no parameters or [training] has no steps")
         else:
@@ -71,18 +74,18 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                            "or shorten time_step there", curves)
             history, cost = {"history": training.columns()}, training.cost
         tested = model_for(definition, truth, dtype, model) if own is None else own
-        tables = history | evaluate(truth, tested, tests, last, dtype)
+        tables = history | evaluate(truth, tested, last, dtype)
         if model.networks:
             tables["feature_range"] = vars(feature_range(data))
         description = definition.describe(truth.scales) | {"training": cost,
                                                            "coefficients": tested.learned_coefficients}
         of_named = {str(path): truth.reference.get("mach_turbulent")
-                    for path, truth in zip(settings.truth_files, trained_on)}
-        provenance = {**stage_provenance(scene, "train"), "mach_turbulent": truth.reference.get("mach_turbulent"),
-                      "truths": {path: product_provenance(path).get("id") for path in of_named},
-                      "mach_of_truths": of_named}
+                    for path, truth in zip(settings.truth_files, truths)}
+        provenance |= {"mach_turbulent": truth.reference.get("mach_turbulent"),
+                       "truths": {path: product_provenance(path).get("id") for path in of_named},
+                       "mach_of_truths": of_named}
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}
-    save_weights(comm, directory / STAGES["train"].file, "model", description, weights, provenance, tables)
+    save_weights(comm, product, "model", description, weights, provenance, tables)
     guard.checkpoints.remove()
     if curves is not None:  # after the product is written: a failing picture must not lose it
         curves.draw(training)
@@ -93,6 +96,35 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
              else "release of the tracers; trained on other ground truths")
     log.info("model: a-priori acceleration error %.3f%s, measured a time of %.3g after the %s",
              errors["acceleration_error"][-1], beside, errors["delay"][-1], since)
+
+
+def take_weights(source: StoredWeights, definition: ModelDefinition, seen: float, provenance: Mapping[str, Any],
+                 truth: GroundTruth, product: Path) -> None:
+    """Write model.h5 with the weights that [model] path names, without training; collective.
+
+    Terms work in units of the flow (Eq. 4), so only the scales and the radius of interaction are those of this flow.
+    Tables are copied from the source, except the a-priori tests, which are repeated on this flow. The tests on the flow
+    of the training are kept as `source_a_priori` if the source has them. The cost of training is copied too. `seen` is
+    the training window as a fraction of this ground truth.
+    """
+    comm = truth.decomposition.comm
+    model = trained_model(definition, source, truth.scales, comm).to(truth.device).forced(truth.forcing)
+    dtype = next((parameter.dtype for parameter in model.parameters()), torch.float64)
+    tables = evaluate(truth, model, last_seen(seen, len(truth.times)), dtype)
+    description = definition.describe(truth.scales) | {"coefficients": model.learned_coefficients}
+    if "training" in source.description:
+        description["training"] = source.description["training"]
+    origin, own_errors = trained_on(source, definition.model.path)
+    provenance = {**provenance, "mach_turbulent": truth.reference.get("mach_turbulent"), "source": origin}
+    kept = source.tables | ({"source_a_priori": own_errors} if own_errors else {})
+    save_weights(comm, product, "model", description, source.weights, provenance, kept | tables)
+    errors, beside = tables["a_priori"], []
+    if "pressure_gradient_error" in errors:
+        beside.append(f"exact filtered pressure gradient {errors['pressure_gradient_error'][-1]:.3f}")
+    beside.append(f"on the flow of its training {own_errors['acceleration_error'][-1]:.3f}" if own_errors else
+                  f"trained on {', '.join(origin['truths'])}")
+    log.info("model: weights of %s; acceleration error %.3f (%s)", source.path, errors["acceleration_error"][-1],
+             "; ".join(beside))
 
 
 class LearningCurves:

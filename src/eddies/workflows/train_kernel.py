@@ -32,7 +32,7 @@ from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS
 from eddies.workflows.ground_truth.truth import GroundTruth, open_truth
 from eddies.workflows.learned.training_phases import take_all_steps
-from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
+from eddies.workflows.run_directory.fingerprints import stage_provenance
 
 log = logging.getLogger("eddies")
 
@@ -49,14 +49,14 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     training continues from its newest checkpoint.
     """
     prepare_torch("cpu", comm)
-    settings, directory = scene.kernel, Path(directory)
+    settings, directory, provenance = scene.kernel, Path(directory), stage_provenance(scene, "train-kernel")
     support = scene.kernel_support
     with open_truth(comm, directory / STAGES["dns"].file, planes=scene.tracers.cells) as truth:
         seen = np.flatnonzero(truth.fields.times <= scene.window * truth.times[-1])
         chosen = evenly(len(seen), KERNEL_FIELDS)
         samples = [load_sample(truth, index, support) for index in chosen]
         unseen, scales = load_sample(truth, len(truth.fields.times) - 1, support), truth.scales
-    guard = Guard(comm, directory / STAGES["train-kernel"].checkpoints, stage_fingerprint(scene, "train-kernel"), stop,
+    guard = Guard(comm, directory / STAGES["train-kernel"].checkpoints, provenance["fingerprint"], stop,
                   " of the training")
     mean_volume = None if settings.positive else scene.tracers.spacing**3
     training = training_of(settings, support, mean_volume, scene.seed, samples)
@@ -72,7 +72,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                    "mean_volume": networks["learned"].mean_volume, "reconstruction": settings.form}
     weights = {name: tensor.numpy() for name, tensor in networks["learned"].state_dict().items()}
     save_weights(comm, directory / STAGES["train-kernel"].file, "kernel", description, weights,
-                 stage_provenance(scene, "train-kernel"), tables)
+                 provenance, tables)
     guard.checkpoints.remove()
     errors = tables["errors"]
     log.info("kernel: errors of averages: velocity %.3f (with a cubic spline %.3f), gradient %.3f (with a cubic spline "

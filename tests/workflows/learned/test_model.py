@@ -11,12 +11,14 @@ from torch import nn
 from eddies.io.hdf5 import ProductError
 from eddies.io.provenance import product_provenance
 from eddies.io.weights import load_weights, save_weights
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.flow_units import ReferenceScales
+from eddies.particles.particle_set import ParticleSet
 from eddies.particles.smoothing_kernels import KernelNetwork
-from eddies.scene.scene import Model, SceneError, load_scene
+from eddies.scene.scene import BOX_LENGTH, Model, SceneError, load_scene
 from eddies.scene.terms import PRESETS
-from eddies.workflows.learned.model import (initial_model, load_form, load_model,
-                                            take_from_first_rank)
+from eddies.workflows.learned.model import initial_model, load_form, take_from_first_rank, trained_model
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 from eddies.workflows.train_kernel import keep_form
@@ -53,13 +55,45 @@ def test_a_model_is_read_as_it_was_saved_for_the_scales_of_another_flow(comm, tm
     of, model, path = saved(comm, tmp_path)
     other = replace(SCALES, velocity=3.0, sound_speed=5.0, spacing=2 * SCALES.spacing,
                     filter_width=2 * SCALES.filter_width)
-    loaded = load_model(of, comm, path, other)
+    stored = load_weights(comm, path, "model")
+    loaded = trained_model(of, stored, other, comm)
     assert list(loaded.terms) == list(model.terms) == list(PRESETS["resolved + pairs"])
     assert all(torch.equal(tensor, loaded.state_dict()[name]) and tensor.dtype == torch.float32
                for name, tensor in model.state_dict().items())
     assert loaded.flow.cutoff == pytest.approx(2 * model.flow.cutoff)
     assert loaded.flow.scales == other and all(term.flow is loaded.flow for term in loaded.terms.values())
-    assert load_weights(comm, path, "model").description["scales"] == SCALES.to_dict()
+    assert stored.description["scales"] == SCALES.to_dict()
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("preset, weight", [("paper", 1e-5), ("resolved + pairs", 1e-4), ("resolved", 1e-6)])
+def test_the_same_flow_in_other_units_gets_the_same_force_in_those_units(comm, tmp_path, preset, weight):
+    """Twice as fast, and with four times the fluctuations of density at the same speed of sound."""
+    of = ModelDefinition.of(load_scene(TINY, [f"model.preset={preset}"]))
+    model = initial_model(of, SCALES, comm).float()
+    weights = {name: tensor.numpy() for name, tensor in model.state_dict().items()}
+    other = replace(SCALES, velocity=1.8, density=0.08, acceleration=6.8, density_rate=0.4,
+                    viscosity=2 * SCALES.viscosity)
+    save_weights(comm, tmp_path / "model.h5", "model", of.describe(SCALES), weights, {})
+    adopted = trained_model(of, load_weights(comm, tmp_path / "model.h5", "model"), other, comm)
+    assert adopted.flow.scales == other and adopted.flow.cutoff == model.flow.cutoff
+    assert all(parameter.dtype == torch.float32 for parameter in adopted.parameters())
+
+    slab, generator = SlabDecomposition(comm, BOX_LENGTH, 12), torch.manual_seed(2)
+    position = BOX_LENGTH * torch.rand(600, 3, dtype=torch.float64, generator=generator)
+    velocity = torch.randn(600, 3, dtype=torch.float64, generator=generator)
+    contrast = 0.02 * torch.randn(600, dtype=torch.float64, generator=generator)
+
+    def acceleration(model, speed):
+        density = 1 + speed**2 * contrast if model.integrates_density else None
+        particles = ParticleSet(torch.arange(600), position, speed * velocity, density)
+        with torch.no_grad():
+            return ParticleDynamics(slab, model, 0.0, torch.float32).rates(particles).acceleration
+
+    expected, found = acceleration(model, 1), acceleration(adopted, 2)
+    assert expected.norm() > 1
+    # Single precision.
+    assert (found - 4 * expected).norm() < weight * found.norm()
 
 
 @pytest.mark.mpi(2)
@@ -69,10 +103,10 @@ def test_weights_of_another_model_are_refused(comm, tmp_path):
                    lambda weights: {name.replace("factor", "strength"): each for name, each in weights.items()}):
         of, _, path = saved(comm, tmp_path, change=change)
         with pytest.raises(ProductError, match="model.h5: .*parameters do not fit.* `eddies train`"):
-            load_model(of, comm, path, SCALES)
+            trained_model(of, load_weights(comm, path, "model"), SCALES, comm)
     _, _, path = saved(comm, tmp_path)
     with pytest.raises(ProductError, match=r"model.h5: .*\[model.pairs\] hidden = \[4\], .* \[5\]"):
-        load_model(definition("model.pairs.hidden=[5]"), comm, path, SCALES)
+        trained_model(definition("model.pairs.hidden=[5]"), load_weights(comm, path, "model"), SCALES, comm)
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -3,18 +3,19 @@
 import json
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from eddies.io.hdf5 import ProductError
-from eddies.io.weights import save_weights
+from eddies.io.weights import StoredWeights, save_weights
 from eddies.particles.flow_units import ReferenceScales
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Model, SceneError, load_scene
 from eddies.stages import Step, check_inputs
-from eddies.workflows.learned.model import load_model
-from eddies.workflows.learned.source import ModelDefinition, read_source
+from eddies.workflows.learned.model import trained_model
+from eddies.workflows.learned.source import ModelDefinition, read_source, trained_on
 from tests.small_scene import TINY, one_model
 
 # The filter width is two spacings, as in the scene tiny.
@@ -130,7 +131,7 @@ def test_weights_of_the_first_version_are_read(comm, name, base):
     found = one_model(base, [*changes, f"model.path=eddies:{name}"])
     source = read(found, comm)
     scales = ReferenceScales(**source.description["scales"])
-    model = load_model(ModelDefinition.of(found), comm, source.path, scales)
+    model = trained_model(ModelDefinition.of(found), source, scales, comm)
     assert {key: value.shape for key, value in source.weights.items()} == {
         key: tuple(value.shape) for key, value in model.state_dict().items()}
 
@@ -141,3 +142,22 @@ def test_a_former_key_with_another_value_is_another_model():
     for force, differences in ((True, []), (False, [("[model.pressure] force", "true", "false")])):
         description["terms"]["pressure"] = {"force": force}
         assert list(resolved.differences(description)) == differences
+
+
+def source_of(provenance, tables):
+    return StoredWeights(Path("model.h5"), {}, {}, tables, provenance)
+
+
+def test_the_run_in_which_weights_were_trained_is_kept_from_run_to_run():
+    errors, mach = {"a_priori": {"acceleration_error": 0.3}}, {"mach_turbulent": 0.08}
+    origin, own = trained_on(source_of(mach, errors), "runs/first")
+    assert origin == {"path": "runs/first", **mach} and own == errors["a_priori"]
+    tables = {"a_priori": {"acceleration_error": 0.5}, "source_a_priori": own}
+    assert trained_on(source_of({"mach_turbulent": 0.16, "source": origin}, tables), "runs/second") == (origin, own)
+
+    # Trained on another flow only: the Mach number and the errors are not those of the run.
+    elsewhere = mach | {"made_from": {"ground_truth": "t1"}, "truths": {"runs/a/ground_truth.h5": "t2"},
+                        "mach_of_truths": {"runs/a/ground_truth.h5": 0.04}}
+    found = trained_on(source_of(elsewhere, errors), "runs/first")
+    assert found == ({"path": "runs/first", "truths": {"runs/a/ground_truth.h5": 0.04}}, None)
+    assert trained_on(source_of(mach | {"source": found[0]}, errors), "runs/second") == found

@@ -18,14 +18,13 @@ from eddies.scene.scene import load_scene
 from eddies.workflows import dns, train
 from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
 from eddies.workflows.ground_truth.frame_counts import last_seen, rollout_start
-from eddies.workflows.learned import transfer
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.learned.training_data import load_frame, model_for, training_data
 from eddies.workflows.learned.truths import open_truths, truth_problems
 from eddies.workflows.problems import Context, problems
-from eddies.workflows.rollout.eulerian_run import EulerianRun
-from eddies.workflows.rollout.particle_run import forcing_of
+from eddies.workflows.rollout.method import forcing_of, make_method
 from tests.changed_product import changed
+from tests.workflows.small_rollout import with_method
 
 CPU = torch.device("cpu")
 SCENE = """
@@ -158,7 +157,7 @@ def test_the_same_is_learned_of_the_same_flow_in_other_units(comm, tmp_path, qui
     assert np.allclose(unseen["history"]["loss"], seen["history"]["loss"], rtol=1e-9)
     assert np.allclose(unseen["a_priori"]["acceleration_error"], seen["a_priori"]["acceleration_error"], rtol=1e-9)
     # Weights of another run keep the name of the flow of their training.
-    transfer.run(replace(scene, model=replace(scene.model, path=str(own))), comm, tmp_path / "fast")
+    train.run(replace(scene, model=replace(scene.model, path=str(own))), comm, tmp_path / "fast")
     source = product_provenance(tmp_path / "fast/model.h5")["source"]
     (truth, mach), = source["truths"].items()
     assert truth == str(tmp_path / "fast/ground_truth.h5") and source["path"] == str(own)
@@ -216,7 +215,7 @@ def test_a_rollout_is_forced_like_its_truth_and_starts_after_the_training_window
             forcing = forcing_of(power, scene.forcing, truth)
             assert (forcing and forcing.injection_rate) == rate
         ends = last_seen(scene.training.window, len(truth.times))
-        coarse = EulerianRun(scene, truth, ends, tmp_path, CPU)
+        coarse = make_method(with_method(scene, "eulerian"), None, truth, ends, tmp_path)
         assert coarse.fluid.forcing.injection_rate == 1.0 and coarse.fluid.forcing.wavenumber == 2.0
         # Each frame has a field. The first frame has no rates.
         for each, start in ((scene, ends), (trained_on(scene, other), 1)):

@@ -13,7 +13,7 @@ from torch import nn
 from torch.nn.parameter import is_lazy
 
 from eddies.io.hdf5 import ProductError
-from eddies.io.weights import load_weights
+from eddies.io.weights import StoredWeights, load_weights
 from eddies.parallel.broadcast import first_complaint, on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import any_rank
@@ -87,12 +87,13 @@ def _bytes(tensor: torch.Tensor) -> np.ndarray:
     return tensor.reshape(-1).view(torch.uint8).numpy()
 
 
-def load_model(definition: ModelDefinition, comm: Comm, path: str | Path, scales: ReferenceScales) -> LagrangianModel:
-    """The model with the weights of a file, in their precision, for a flow of these scales; all ranks call it.
+def trained_model(definition: ModelDefinition, stored: StoredWeights, scales: ReferenceScales,
+                  comm: Comm) -> LagrangianModel:
+    """The model with stored weights, in their precision, for a flow of these scales; collective.
 
-    Raises ProductError if the file cannot be read or holds weights of another model.
+    Raises ProductError if the weights are those of another model.
     """
-    stored = load_weights(comm, path, "model")
+    path = stored.path
     for key, wanted, trained in definition.differences(stored.description):
         raise ProductError(f"{path}: was trained with {key} = {trained}, but the scene has {wanted}; run "
                            f"`eddies train` again, or set {key} = {trained}")

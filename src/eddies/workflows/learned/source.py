@@ -8,8 +8,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, asdict, dataclass, fields
 from typing import Any
 
+import numpy as np
+
 from eddies.import_path import short_name
 from eddies.io.hdf5 import ProductError
+from eddies.io.provenance import others_trained_on
 from eddies.io.weights import StoredWeights, load_weights
 from eddies.parallel.communicator import Comm
 from eddies.particles.flow_units import FlowUnits, ReferenceScales
@@ -95,3 +98,18 @@ def read_source(name: str, definition: ModelDefinition, comm: Comm) -> StoredWei
         raise SceneError(f"{name}: {key} = {wanted}, but {path} was trained with {trained}; set "
                          f"{key} = {trained}, or give another [model] path")
     return source
+
+
+def trained_on(source: StoredWeights, path: str) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:
+    """The origin of the weights of a source, and the a-priori errors on the flow of the training.
+
+    The origin has `path` and `mach_turbulent` of the run that trained the weights. A source that took its weights from
+    another run stores this origin. If the source was trained only on ground truths of other runs, the origin has
+    `truths`, their Mach numbers, instead of `mach_turbulent`, and the errors are None.
+    """
+    origin = source.provenance
+    if "source" in origin:
+        return origin["source"], source.tables.get("source_a_priori")
+    if others_trained_on(origin):
+        return {"path": path, "truths": origin["mach_of_truths"]}, None
+    return {"path": path, "mach_turbulent": origin.get("mach_turbulent")}, source.tables["a_priori"]

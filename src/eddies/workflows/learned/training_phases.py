@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from statistics import fmean
 from typing import TypeVar
 
@@ -21,6 +22,7 @@ from eddies.particles.feature_range import FeatureRange, pair_features
 from eddies.particles.smoothing_kernels import SmoothingKernel
 from eddies.scene.scene import SceneError
 from eddies.scene.values import import_paths
+from eddies.workflows.learned.model import load_form
 from eddies.workflows.learned.training_data import TrainingData
 
 log = logging.getLogger("eddies")
@@ -33,6 +35,16 @@ VALIDATIONS, HORIZON_VALIDATIONS = 25, 4
 LEAST_VALIDATIONS = 4
 
 Trainer = TypeVar("Trainer")
+
+
+def training_phases(data: Sequence[TrainingData], kernel_file: Path) -> list[Phase]:
+    """All phases of a training; none if the model has no parameters. Only the field loss averages with the kernel."""
+    if next(data[0].model.parameters(), None) is None:
+        return []
+    kernel, truth = None, data[0].truth
+    if data[0].settings.field_weight > 0:
+        kernel = load_form(truth.decomposition.comm, kernel_file, truth.scales, truth.device).kernel
+    return [*one_step_phases(data, kernel), *horizon_phases(data)]
 
 
 def one_step_phases(data: Sequence[TrainingData], kernel: SmoothingKernel | None) -> list[Phase]:

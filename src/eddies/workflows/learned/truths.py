@@ -26,11 +26,9 @@ def open_truths(own_file: Path, named: Sequence[Path], comm: Comm,
     If none is named, the list holds the run's own ground truth.
     """
     with ExitStack() as files:
-        def opened(path: Path) -> GroundTruth:
-            return files.enter_context(open_truth(comm, path, device))
-
-        own = opened(own_file)
-        yield own, [own if path.resolve() == own_file.resolve() else opened(path) for path in named or (own_file,)]
+        own = files.enter_context(open_truth(comm, own_file, device))
+        yield own, [own if path.resolve() == own_file.resolve() else files.enter_context(open_truth(comm, path, device))
+                    for path in named or (own_file,)]
 
 
 def truth_problems(settings: Training, tracers: Tracers, reads: Collection[str], own_file: Path,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,19 +18,17 @@ from eddies.flow.stability import quadratic_energy
 from eddies.flow.subgrid import Closure, DynamicStress, EddyDamping, SpectralViscosity, StressModel
 from eddies.flow.tracers import FilteredField, TracerParticles
 from eddies.io.checkpoint import Checkpoint
-from eddies.io.weights import load_weights
 from eddies.parallel.migration import migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.resolved_velocity import ResolvedVelocity
-from eddies.pipeline import STAGES
-from eddies.scene.scene import Eulerian, Scene, SceneError
+from eddies.scene.scene import Eulerian, Flow, SceneError
+from eddies.scene.terms import Forcing
 from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.time_stepping import ETDRK4
 from eddies.workflows.ground_truth.flow_run import restored_modes, saved_modes
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.rollout.particle_run import forcing_of
 from eddies.workflows.rollout.saved_particles import restored_rows, saved_rows
 
 # A flow is unstable if its energy exceeds its initial energy by this factor.
@@ -44,30 +41,28 @@ class EulerianRun:
     The initial state has those modes of the unfiltered velocity that the grid can hold. They are read from the true
     flow, or found from the velocities of the particles. If the equations are for the filtered velocity, these modes are
     filtered first. The particles always follow the filtered velocity.
+
+    Parameters
+    ----------
+    fluid : on the coarse grid. longest_step, courant : limits of the step.
+    interpolation : the splines from the grid to the particles.
     """
 
-    def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:
-        self.settings, self.longest_step = scene.eulerian or Eulerian(), scene.simulation.longest_step
-        comm, length, width = truth.decomposition.comm, truth.decomposition.length, truth.scales.filter_width
-        cells = self.settings.cells_for(width)
-        grid = SpectralGrid(SlabDecomposition(comm, length, cells), scene.simulation.precision)
+    def __init__(self, settings: Eulerian, fluid: Fluid, truth: GroundTruth, start: int, longest_step: float,
+                 courant: float, interpolation: str) -> None:
+        self.settings, self.fluid, self.longest_step = settings, fluid, longest_step
+        grid = fluid.grid
         # Widths of two filters: one that the fluid's velocity has passed, and one still to apply for the particles.
-        filter_passed = width if self.settings.equations == "filtered" else 0.0
-        filter_left = 0.0 if filter_passed else width
-        forcing = None
-        if (forced := forcing_of(scene.simulation.injection, scene.forcing, truth)) is not None:
-            forcing = LinearForcing(grid, forced.injection_rate, forced.wavenumber, filter_passed)
-        sound_speed = scene.flow.sound_speed if self.settings.compressible else math.inf
-        closure = closure_of(self.settings, grid, filter_passed, directory, scene.model and scene.model.damping)
-        self.fluid = FLUIDS[self.settings.fluid](grid, scene.flow.viscosity, sound_speed, forcing, closure=closure)
-        self.stepper, self.clock = ETDRK4(self.fluid), Clock()
-        self.step_limit = CourantLimit(grid, scene.time.courant, math.inf)
-        state_of = {"flow": initial_state, "particles": state_of_particles}[self.settings.start]
-        self.state = state_of(truth, self.fluid, filter_passed, start)
-        self.largest_energy = RUNAWAY_ENERGY * quadratic_energy(self.fluid, self.state)
+        filter_passed = filter_of(settings, truth)
+        filter_left = 0.0 if filter_passed else truth.scales.filter_width
+        self.stepper, self.clock = ETDRK4(fluid), Clock()
+        self.step_limit = CourantLimit(grid, courant, math.inf)
+        state_of = {"flow": initial_state, "particles": state_of_particles}[settings.start]
+        self.state = state_of(truth, fluid, filter_passed, start)
+        self.largest_energy = RUNAWAY_ENERGY * quadratic_energy(fluid, self.state)
         columns = truth.particles(start)
         columns = migrate(grid.decomposition, {name: columns[name] for name in ("id", "position")})
-        field = FilteredField(grid, filter_left, scene.tracers.interpolation, margin=math.ceil(scene.time.courant))
+        field = FilteredField(grid, filter_left, interpolation, margin=math.ceil(courant))
         self.tracers = TracerParticles(field, columns, self.state)
         self.flow_seconds: list[float] = []
 
@@ -159,24 +154,37 @@ class EulerianRun:
                 "closure": self.settings.closure + constant, "start": self.settings.start, **seconds}
 
 
-def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float, directory: Path,
-               damping: str | None) -> Closure | None:
+def coarse_fluid(settings: Eulerian, flow: Flow, precision: str, forcing: Forcing | None, truth: GroundTruth,
+                 damping: np.ndarray | None) -> Fluid:
+    """The fluid on its coarse grid, with its forcing and its closure. `damping` has the rates of a learned closure."""
+    slab, width = truth.decomposition, truth.scales.filter_width
+    grid = SpectralGrid(SlabDecomposition(slab.comm, slab.length, settings.cells_for(width)), precision)
+    filter_passed = filter_of(settings, truth)
+    forced = forcing and LinearForcing(grid, forcing.injection_rate, forcing.wavenumber, filter_passed)
+    sound_speed = flow.sound_speed if settings.compressible else math.inf
+    closure = closure_of(settings, grid, filter_passed, damping)
+    return FLUIDS[settings.fluid](grid, flow.viscosity, sound_speed, forced, closure=closure)
+
+
+def filter_of(settings: Eulerian, truth: GroundTruth) -> float:
+    """Width of the filter that the velocity of the equations has passed: that of the truth, or 0 without a filter."""
+    return truth.scales.filter_width if settings.equations == "filtered" else 0.0
+
+
+def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float,
+               damping: np.ndarray | None) -> Closure | None:
     """The closure of the equations for a velocity that has passed a filter of this width.
 
     If `filter_width` is 0, the filter is the sharp cut-off of the grid at its highest wavenumber k_c, and Smagorinsky's
-    length Delta is pi/k_c. `damping` names the parameter in the directory's model.h5 that a learned closure takes.
+    length Delta is pi/k_c.
     """
-    def learned() -> Closure:
-        stored = load_weights(grid.decomposition.comm, directory / STAGES["train"].file, "model")
-        return EddyDamping(grid, stored.weights[f"terms.{damping}"])
-
     width = filter_width or math.pi / grid.cutoff
     made = {
         "none": lambda: None,
         "smagorinsky": lambda: StressModel(grid, mixing_length=settings.smagorinsky * width),
         "dynamic-smagorinsky": lambda: DynamicStress(grid, filter_width),
         "spectral": lambda: SpectralViscosity(grid),
-        "learned": learned,
+        "learned": lambda: EddyDamping(grid, damping),
         "gradient": lambda: StressModel(grid, filter_width=filter_width),
         "dynamic-mixed": lambda: DynamicStress(grid, filter_width, with_gradient=True),
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -11,16 +10,26 @@ import torch
 
 from eddies.import_path import is_path, load, users_code
 from eddies.io.checkpoint import Checkpoint
+from eddies.io.weights import load_weights
+from eddies.particles.feature_range import FeatureRange
+from eddies.particles.model import LagrangianModel
 from eddies.particles.particle_set import ParticleSet
-from eddies.scene.scene import Scene, SceneError
+from eddies.pipeline import STAGES
+from eddies.scene.scene import Eulerian, Scene, SceneError
+from eddies.scene.scene import Forcing as ForcingSection
+from eddies.scene.terms import Forcing
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.rollout.eulerian_run import EulerianRun
+from eddies.workflows.learned.model import trained_model
+from eddies.workflows.learned.source import ModelDefinition
+from eddies.workflows.rollout.eulerian_run import EulerianRun, coarse_fluid
 from eddies.workflows.rollout.particle_run import ParticleRun
 
 
 class Method(Protocol):
-    """Moves the particles of a rollout. Class(scene, truth, start, directory, device) makes an instance, where `start`
-    is the frame of the ground truth at which the rollout starts. All methods are collective.
+    """Moves the particles of a rollout. All methods are collective.
+
+    Class(scene, truth, start, directory, device) makes an instance of a user's class, where `start` is the frame of the
+    ground truth at which the rollout starts.
 
     `state_dict` and `load_state_dict` may be missing: a stopped rollout then starts again from the beginning.
     """
@@ -52,10 +61,6 @@ class Method(Protocol):
         """Continue from a checkpoint, made on any number of ranks; exact on the same number of ranks."""
 
 
-#: The class of each built-in [simulation] method.
-METHODS: dict[str, Callable[..., Method]] = {"learned": ParticleRun, "none": ParticleRun, "eulerian": EulerianRun}
-
-
 @dataclass(frozen=True)
 class TimeStep:
     """Integrator and longest time step of a rollout. On a coarse grid they are "etdrk4" and the Courant number."""
@@ -69,16 +74,43 @@ def make_method(scene: Scene, step: TimeStep | None, truth: GroundTruth, start: 
 
     A given `step` replaces the step of the scene. The resolved velocity then does not limit the step.
     """
-    settings = scene.simulation
+    settings, courant = scene.simulation, scene.time.courant
     if step is not None and settings.on_grid:
-        scene = replace(scene, time=replace(scene.time, courant=step.size))
+        courant = step.size
     elif step is not None:
-        given = replace(settings, integrator=step.integrator, step=step.size, step_from=None, confirmed_on=None)
-        scene = replace(scene, simulation=given)
-    kind = load(settings.method) if is_path(settings.method) else METHODS[settings.method]
-    hint = f'; [simulation] method = "{settings.method}" is called with (scene, truth, start, directory, device)'
-    with users_code(kind, SceneError, hint):
-        method = kind(scene, truth, start, directory, truth.device)
-    if step is not None and isinstance(method, ParticleRun):
-        method.limited = False
-    return method
+        settings = replace(settings, integrator=step.integrator, step=step.size, step_from=None, confirmed_on=None)
+    if is_path(settings.method):
+        kind = load(settings.method)
+        hint = f'; [simulation] method = "{settings.method}" is called with (scene, truth, start, directory, device)'
+        with users_code(kind, SceneError, hint):
+            return kind(replace(scene, simulation=settings), truth, start, directory, truth.device)
+    comm, trained = truth.decomposition.comm, directory / STAGES["train"].file
+    forcing = forcing_of(settings.injection, scene.forcing, truth)
+    if settings.on_grid:
+        eulerian, rates = scene.eulerian or Eulerian(), None
+        if eulerian.form.learned:
+            rates = load_weights(comm, trained, "model").weights[f"terms.{scene.model.damping}"]
+        fluid = coarse_fluid(eulerian, scene.flow, settings.precision, forcing, truth, rates)
+        return EulerianRun(eulerian, fluid, truth, start, settings.longest_step, courant, scene.tracers.interpolation)
+    definition, seen = ModelDefinition.of(scene), None
+    model = LagrangianModel({}, definition.units(truth.scales))
+    if "model" in settings.needs:
+        stored = load_weights(comm, trained, "model")
+        model = trained_model(definition, stored, truth.scales, comm)
+        seen = FeatureRange(**stored.tables["feature_range"]) if model.networks else None
+    return ParticleRun(model.forced(forcing), seen, settings, truth, start, limited=step is None)
+
+
+def forcing_of(power: str | float, section: ForcingSection | None, truth: GroundTruth) -> Forcing | None:
+    """The forcing of a rollout, or None if the rollout is not forced.
+
+    `power` is the key `injection` of [simulation]. "truth" gives the forcing of the ground truth, "none" gives no
+    forcing, and a number is the power per mass. "dissipation" gives the dissipation rate of the ground truth. The
+    forced wavenumbers are those of `section`, [forcing] of the scene; without such a section they are below 2.
+    """
+    if power == "truth":
+        return truth.forcing
+    if power == "none":
+        return None
+    return Forcing(injection_rate=truth.reference["dissipation_rate"] if power == "dissipation" else power,
+                   wavenumber=section.wavenumber if section else 2.0)

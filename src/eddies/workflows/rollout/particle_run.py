@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
 from eddies.io.checkpoint import Checkpoint
-from eddies.io.hdf5 import open_product, read_table
 from eddies.parallel.broadcast import first_complaint
 from eddies.parallel.halo import HaloError
 from eddies.particles.dynamics import ParticleDynamics
@@ -22,13 +20,9 @@ from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.model import LagrangianModel
 from eddies.particles.moment import Moment, between
 from eddies.particles.particle_set import ParticleSet
-from eddies.pipeline import STAGES
-from eddies.scene.scene import Forcing as ForcingSection
-from eddies.scene.scene import Scene
-from eddies.scene.terms import Forcing
+from eddies.scene.scene import Simulation
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.learned.model import load_model, particles_for
-from eddies.workflows.learned.source import ModelDefinition
+from eddies.workflows.learned.model import particles_for
 from eddies.workflows.rollout.saved_particles import particle_state, restored_particles
 
 log = logging.getLogger("eddies")
@@ -41,33 +35,29 @@ SOLVES = "solves", "iterations", "most_iterations", "residual", "not_converged"
 
 
 class ParticleRun:
-    """The particles of a frame of the ground truth, moved by the trained model of the run directory, or by no force.
+    """The particles of a frame of the ground truth, moved by a model, which may have no terms.
 
-    The units are the scales of the flow at the release of the tracers, as in training. `seen` is the range of network
-    inputs in the training, None without networks. `limited` tells whether the resolved velocity limits the step; it is
-    false if the step was found by rollouts. Particles without forces have no neighbour list and send no message.
+    Particles without forces have no neighbour list and send no message.
+
+    Parameters
+    ----------
+    model : in the units of the flow at the release of the tracers, as in training.
+    seen : the range of network inputs in the training, None without networks.
+    limited : whether the resolved velocity limits the step; false if the step was found by rollouts.
     """
 
-    def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:
-        definition, forcing = ModelDefinition.of(scene), forcing_of(scene.simulation.injection, scene.forcing, truth)
-        self.settings, self.comm, self.scales = scene.simulation, truth.decomposition.comm, truth.scales
-        self.flow, dtype = definition.units(self.scales), getattr(torch, self.settings.precision)
-        model, deviation, self.limited = LagrangianModel({}, self.flow), np.inf, True
-        self.seen: FeatureRange | None = None
-        if "model" in self.settings.needs:
-            path = directory / STAGES["train"].file
-            model = load_model(definition, self.comm, path, self.scales)
-            if model.integrates_density and self.scales.density is not None:
-                deviation = max(RUNAWAY_DENSITY * self.scales.density, self.scales.density_mean)
-            if model.networks:
-                with open_product(self.comm, path, "model") as file:
-                    self.seen = FeatureRange(**read_table(file, "feature_range"))
-        self.model = model.forced(forcing).to(dtype=dtype, device=device)
-        self.dynamics = ParticleDynamics(truth.decomposition, self.model, self.settings.skin * self.flow.cutoff, dtype)
-        self.integrator = INTEGRATORS[self.settings.scheme.name](self.dynamics)
-        self.particles, self.total = particles_for(self.model, truth.particles(start), device), truth.total
+    def __init__(self, model: LagrangianModel, seen: FeatureRange | None, settings: Simulation, truth: GroundTruth,
+                 start: int, limited: bool) -> None:
+        self.settings, self.comm, self.seen, self.limited = settings, truth.decomposition.comm, seen, limited
+        scales, dtype, deviation = truth.scales, getattr(torch, settings.precision), np.inf
+        self.model = model.to(dtype=dtype, device=truth.device)
+        self.dynamics = ParticleDynamics(truth.decomposition, model, settings.skin * model.flow.cutoff, dtype)
+        self.integrator = INTEGRATORS[settings.scheme.name](self.dynamics)
+        self.particles, self.total = particles_for(model, truth.particles(start), truth.device), truth.total
         self._before: Moment | None = None
-        self.limits = Limits(RUNAWAY_SPEED * self.scales.velocity, self.scales.density_mean, deviation)
+        if model.integrates_density and scales.density is not None:
+            deviation = max(RUNAWAY_DENSITY * scales.density, scales.density_mean)
+        self.limits = Limits(RUNAWAY_SPEED * scales.velocity, scales.density_mean, deviation)
         self._shares_outside: list[float] = []
         self._solves: dict[str, list[float]] = {name: [] for name in SOLVES}
 
@@ -182,18 +172,3 @@ class ParticleRun:
         """Integrator, terms, whether they integrate a density, and the number of evaluations of the rates."""
         return {"integrator": self.settings.scheme.name, "terms": ", ".join(self.model.terms) or "none",
                 "integrates_density": self.model.integrates_density, "evaluations": self.dynamics.evaluations}
-
-
-def forcing_of(power: str | float, section: ForcingSection | None, truth: GroundTruth) -> Forcing | None:
-    """The forcing of a rollout, or None if the rollout is not forced.
-
-    `power` is the key `injection` of [simulation]. "truth" gives the forcing of the ground truth, "none" gives no
-    forcing, and a number is the power per mass. "dissipation" gives the dissipation rate of the ground truth. The
-    forced wavenumbers are those of `section`, [forcing] of the scene; without such a section they are below 2.
-    """
-    if power == "truth":
-        return truth.forcing
-    if power == "none":
-        return None
-    return Forcing(injection_rate=truth.reference["dissipation_rate"] if power == "dissipation" else power,
-                   wavenumber=section.wavenumber if section else 2.0)
