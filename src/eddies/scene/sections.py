@@ -310,13 +310,16 @@ class Tracers(Section):
         return planes_for(self.particles)
 
 
+#: Cells of the grid of the resolved velocity along a wave of the highest wavenumber; cubic splines can represent it.
+CELLS_PER_WAVENUMBER = 7 / 3
+
+
 def planes_for(particles: int) -> int:
     """`Tracers.planes` for a number of particles N: 1.75 N^(1/3), rounded to even.
 
-    The highest resolved wavenumber is 1.5 times the Nyquist wavenumber of the particles. Its wavelength is then 2.3
-    cells, which cubic splines can represent.
+    The highest resolved wavenumber is 1.5 times the Nyquist wavenumber of the particles, 0.75 N^(1/3).
     """
-    return 2 * round(0.875 * round(math.cbrt(particles), 9))
+    return 2 * round(0.75 / 2 * CELLS_PER_WAVENUMBER * round(math.cbrt(particles), 9))
 
 
 #: Defaults of keys of [kernel], and the values that replace them in each preset.

@@ -40,7 +40,7 @@ from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import load_form
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 from eddies.workflows.track_solver import (HELD_OUT, NO_FILTER, LeastSquaresMethod, best_solver, particles_on,
-                                           solver_of, split, validation_error)
+                                           slabs_for, solver_of, split, validation_error)
 
 log = logging.getLogger("eddies")
 
@@ -80,25 +80,28 @@ class Source:
     Attributes
     ----------
     times : times of the frames. spacing : mean distance of the particles.
-    slab : this rank's part of the box, with the planes of the grid of the modes. resolved_spacing : the distance of
-    particles that would resolve these modes in one frame.
+    scales : the flow's scales, and the `filter_width` and `spacing` of particles that would resolve the modes in one
+    frame. slab : this rank's part of the box, with the planes of the grid of the modes.
     most : largest number of particles in a frame. truth : the ground truth with true fields; None for measured tracks.
     unit, corner : the scene's unit of length and the place of the tracks' origin in the cube, both in the tracks' unit.
     """
 
     def __init__(self, tracks: Tracks | None, tracers: Tracers, settings: Reconstruction, file: File,
                  comm: Comm) -> None:
-        self._tracks, self.truth = None, None
+        self._tracks, self.truth, self.spacing = None, None, tracers.spacing
+        filtered, width = (tracks or tracers).filtered, tracers.filter_width
         if tracks is not None:
             self._tracks = source = TrackFrames(comm, tracks)
             self.times, self.spacing, self.most = source.times, source.spacing, source.most
             self.unit, self.corner = source.about["length_unit"], source.about["corner"]
             tracers = tracers.with_count(source.even_count)
-        resolved = settings.resolving(tracers, (tracks or tracers).filtered)
-        self.slab, self.resolved_spacing = SlabDecomposition(comm, BOX_LENGTH, resolved.planes), resolved.spacing
+        resolved = settings.resolving(tracers, filtered)
+        width = width if filtered else NO_FILTER * self.spacing
+        self.scales = read_attributes(file, "reference") | {"spacing": resolved.spacing, "filter_width": width}
+        self.slab = slabs_for(comm, tracers, resolved, width, self.scales["kolmogorov_length"])
         if tracks is None:
-            self.truth = truth = GroundTruth(file, comm, planes=resolved.planes)
-            self.times, self.spacing, self.most = truth.times, tracers.spacing, truth.total
+            self.truth = truth = GroundTruth(file, comm, planes=self.slab.planes)
+            self.times, self.most = truth.times, truth.total
             self.unit, self.corner = 1.0, np.zeros(3)
 
     def particles(self, frame: int) -> ParticleSet:
@@ -227,12 +230,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                   " of the reconstruction")
     with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as file:
         source = Source(scene.tracks, tracers, settings, file, comm)
-        reference = read_attributes(file, "reference")
+        solver, weight, _ = best_solver(source.particles(0), partial(solver_of, source.slab, source.scales),
+                                        settings.holdout or HELD_OUT)
         filtered = (scene.tracks or tracers).filtered
-        width = tracers.filter_width if filtered else NO_FILTER * source.spacing
-        solver, weight, _ = best_solver(source.particles(0), partial(
-            solver_of, source.slab, reference | {"spacing": source.resolved_spacing, "filter_width": width}),
-            settings.holdout or HELD_OUT)
         grid = solver.grid
         transfer = grid.filter_transfer(tracers.filter_width) if filtered else torch.ones_like(grid.shell)
         kernel: SmoothingKernel = CubicSpline(tracers.radius_of(NEIGHBORS))
@@ -240,7 +240,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             kernel = load_form(comm, directory / STAGES["train-kernel"].file, source.truth.scales).kernel
         make = _maker(settings, tracers, scene.flow.viscosity, kernel, solver, weight, transfer)
         whole = ReconstructionRun(source, [make() for _ in range(2 if settings.holdout > 0 else 1)], solver, settings,
-                                  tracers, reference["viscosity"], transfer)
+                                  tracers, source.scales["viscosity"], transfer)
         saved = guard.checkpoints.newest()
         if saved is not None:
             whole.load_state_dict(saved)

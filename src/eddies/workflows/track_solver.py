@@ -10,13 +10,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.exchanges import mean_over_ranks, relative_error
-from eddies.particles.flow_units import ReferenceScales
+from eddies.particles.flow_units import ReferenceScales, resolved_wavenumber
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import WEIGHT, ResolvedVelocity
+from eddies.scene.scene import BOX_LENGTH, Tracers
+from eddies.scene.sections import CELLS_PER_WAVENUMBER
 
 WEIGHTS = 10.0 ** np.arange(3, -1.1, -0.5)  # weights of the noise in least squares; cross-validation chooses one
 RISE = 1.02             # the search ends when the error exceeds the least error by this factor
@@ -83,6 +86,18 @@ def validation_error(solver: ResolvedVelocity, modes: Tensor, known: ParticleSet
     wanted = held_out.velocity - mean_over_ranks(comm, known.velocity)
     missed = solver.grid.at(modes, solver.grid.points(held_out.position)) - wanted
     return relative_error(comm, missed, wanted)
+
+
+def slabs_for(comm: Comm, tracers: Tracers, resolved: Tracers, filter_width: float,
+              kolmogorov_length: float) -> SlabDecomposition:
+    """Slabs of a grid for the modes that the tracers `resolved` would resolve.
+
+    The spectrum of the flow may end at lower wavenumbers, which need fewer planes; the planes of `tracers` are the
+    fewest.
+    """
+    highest = resolved_wavenumber(resolved.spacing, filter_width, kolmogorov_length)
+    planes = 2 * math.ceil(CELLS_PER_WAVENUMBER / 2 * highest)
+    return SlabDecomposition(comm, BOX_LENGTH, min(max(planes, tracers.planes), resolved.planes))
 
 
 def solver_of(slab: SlabDecomposition, reference: Mapping[str, float], weight: float) -> ResolvedVelocity:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -29,12 +29,13 @@ from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.remembered_velocity import RememberedVelocity
 from eddies.pipeline import STAGES
-from eddies.scene.scene import BOX_LENGTH, Flow, Scene, SceneError, Tracers
+from eddies.scene.scene import BOX_LENGTH, Flow, Model, Scene, SceneError, Simulation, Tracers
 from eddies.scene.sections import Eulerian, Initial, Reconstruction, Tracks
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.workflows.ground_truth.track_frames import TrackFrames, read_measured
 from eddies.workflows.run_directory.fingerprints import stage_provenance
-from eddies.workflows.track_solver import NO_FILTER, LeastSquaresMethod, best_solver, particles_on, solver_of
+from eddies.workflows.track_solver import (NO_FILTER, LeastSquaresMethod, best_solver, particles_on, slabs_for,
+                                           solver_of)
 
 log = logging.getLogger("eddies")
 
@@ -53,7 +54,14 @@ def with_tracks(scene: Scene, comm: Comm) -> Scene:
         if each.tracks != settings:
             raise SceneError(f'variant "{name}": all variants must have the same tracks; set [tracks] for the whole '
                              "scene")
-        for problem in _unfit(each):
+        for section, default in (("initial", Initial()), ("forcing", None), ("spin_up", None)):
+            if getattr(each, section) != default:
+                raise SceneError(f"[{section}]: [tracks] takes the place of this section; remove [{section}]")
+        if each.realisations is not None:
+            raise SceneError(f"realisations = {[*each.realisations]}: the file has one realisation; remove the key, "
+                             "and write a scene for each file")
+        uses = [f"[{section}]" for section in ("kernel", "model", "simulation") if getattr(each, section) is not None]
+        for problem in _unfit(settings, uses, each.reconstruction, each.model, each.simulation, each.eulerian):
             raise SceneError(problem)
     learned = any(part is not None for part in (scene.kernel, scene.model, scene.simulation))
     found = in_files(comm, settings.file, lambda: _sections_of(settings, learned))
@@ -64,23 +72,17 @@ def with_tracks(scene: Scene, comm: Comm) -> Scene:
     return replace(scene, **found, variant={name: replace(each, **found) for name, each in scene.variant.items()})
 
 
-def _unfit(scene: Scene) -> Iterator[str]:
-    """Yield a message for each section or term of a scene that cannot be used with tracks."""
-    settings, model, simulation = scene.tracks, scene.model, scene.simulation
-    for name, default in (("initial", Initial()), ("forcing", None), ("spin_up", None)):
-        if getattr(scene, name) != default:
-            yield f"[{name}]: [tracks] takes the place of this section; remove [{name}]"
-    if scene.realisations is not None:
-        yield (f"realisations = {[*scene.realisations]}: the file has one realisation; remove the key, and write a "
-               "scene for each file")
-    if (wanted := scene.reconstruction) is not None:
+def _unfit(settings: Tracks, learned: Sequence[str], wanted: Reconstruction | None, model: Model | None,
+           simulation: Simulation | None, eulerian: Eulerian | None) -> Iterator[str]:
+    """Yield a message for each setting that cannot be used with tracks. `learned` are the sections of the scene that
+    need a model or a smoothing kernel."""
+    if wanted is not None:
         if settings.viscosity is None and (wanted.method == "memory" or "acceleration" in wanted.fields):
             yield ("[tracks] viscosity: this key is missing, and the method memory and the acceleration need it; give "
                    "it, or change [reconstruction]")
         if settings.volume is not None and wanted.of_neighbors:
             yield (f'[reconstruction] method = "{wanted.method}": its points need particles on all sides, which a '
                    'volume that is not periodic lacks; set method = "least-squares" or "memory"')
-    learned = [f"[{name}]" for name in ("kernel", "model", "simulation") if getattr(scene, name) is not None]
     if learned and not settings.filtered and settings.sound_speed is not None:
         yield (f"[tracks] sound_speed = {settings.sound_speed:g}: the density of the unfiltered flow is no filtered "
                f"density, which models need; remove sound_speed, or {', '.join(learned)}")
@@ -94,7 +96,7 @@ def _unfit(scene: Scene) -> Iterator[str]:
     if simulation is not None and simulation.on_grid:
         if settings.viscosity is None:
             yield '[tracks] viscosity: this key is missing, and [simulation] method = "eulerian" needs it; give it'
-        if (scene.eulerian or Eulerian()).start != "particles":
+        if (eulerian or Eulerian()).start != "particles":
             yield ('[eulerian] start = "flow": measured tracks do not give the unfiltered flow; set start = '
                    '"particles"')
 
@@ -132,15 +134,16 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     viscosity, follows = scene.flow.viscosity, tracers.filtered and not filtered
     complete, times, spacing = tracks.complete, tracks.times, tracks.spacing
     settings = Reconstruction(method="memory" if follows and viscosity > 0 else "least-squares")
-    resolved = settings.resolving(tracers.with_count(tracks.even_count), filtered)
-    slab = SlabDecomposition(comm, BOX_LENGTH, resolved.planes)
+    own = tracers.with_count(tracks.even_count)
     first, second = tracks.shared(0, 1), tracks.shared(1, 0)
     reference = {"filter_width": tracers.filter_width, "spacing": tracers.spacing, "density_mean": 1.0,
                  "viscosity": viscosity, **measured_scales(comm, first, second, times[1])}
     width = tracers.filter_width if filtered else NO_FILTER * spacing
-    particles = particles_on(slab, tracks.frame(0))
     found = {"kolmogorov_length": 0.0} | reference
-    for _ in range(2 if viscosity > 0 else 1):  # the second time with Kolmogorov's length in the prior
+    # The second time with Kolmogorov's length in the prior.
+    for resolved in (own, settings.resolving(own, filtered))[:2 if viscosity > 0 else 1]:
+        slab = slabs_for(comm, own, resolved, width, found["kolmogorov_length"])
+        particles = particles_on(slab, tracks.frame(0))
         make = partial(solver_of, slab, found | {"spacing": resolved.spacing, "filter_width": width})
         solver, weight, error = best_solver(particles, make)
         flow = FrameFlow(solver.grid, solver.of(particles).velocity, particles, filtered, tracers.filter_width)

@@ -49,7 +49,7 @@ def most_ranks(scene: Scene) -> dict[str, int]:
                 reason = min(found, key=found.__getitem__)
                 limits[f"[training] truths: {quoted(name)}: {reason}"] = found[reason]
     if scene.reconstruction:
-        limits[RESOLVED] = resolved_grid_ranks(scene.tracers_resolving, 0.0)
+        limits[RESOLVED] = resolved_grid_ranks(tracers, 0.0)
         if scene.reconstruction.of_neighbors:
             limits |= reach_limit(tracers, scene.kernel_support or tracers.radius_of(NEIGHBORS))
     if scene.coarse_cells:
