@@ -20,7 +20,7 @@ DRIFTS = {"momentum_drift", "density_drift", "count_variance"}
 class Stored:
     """Particles that move; velocities and accelerations are those of the truth times 1 + growth * time."""
 
-    columns = ("position", "velocity", "acceleration")
+    columns, length = ("position", "velocity", "acceleration"), LENGTH
 
     def __init__(self, growth=0.0, times=TIMES, broken=None):
         self.growth, self.times, self.broken = growth, times, broken
@@ -42,7 +42,7 @@ def measured(growth, complete=True, model_times=TIMES, broken=None):
     spectra = {name: dict(enumerate(np.outer(factor**2, SPECTRUM))) for name, factor in factors.items()}
     gradients = {name: {frame: Invariants.of(one * GRADIENT) for frame, one in enumerate(factor)}
                  for name, factor in factors.items()}
-    return accuracy(Rollout(attributes, *runs.values(), LENGTH, flow, {
+    return accuracy(Rollout(attributes, *runs.values(), flow, {
         "kolmogorov_time": 0.15, "filter_width": np.pi / 6.0}, spectra, gradients))
 
 

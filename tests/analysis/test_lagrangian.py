@@ -17,7 +17,7 @@ TETRADS = near_tetrads(START, LENGTH)
 class Paths:
     """Particles from START with constant velocities and accelerations that turn."""
 
-    columns, times = ("position", "velocity", "acceleration"), TIMES + 3.0
+    columns, times, length = ("position", "velocity", "acceleration"), TIMES + 3.0, LENGTH
 
     def __init__(self, factor=1.0, wind=0.0):
         self.factor, self.wind = factor, wind
@@ -31,7 +31,7 @@ class Paths:
 
 
 def measured(paths):
-    return path_statistics(paths, range(len(TIMES)), TETRADS, LENGTH)
+    return path_statistics(paths, range(len(TIMES)), TETRADS)
 
 
 def test_ballistic_particles_part_as_time_squared():
@@ -76,7 +76,7 @@ def test_differences_are_logarithms_of_ratios():
     assert faster["acceleration_variance_error"] == pytest.approx(2)
     assert faster["acceleration_correlation_error"] == pytest.approx(0, abs=1e-12)
     assert 0.5 < faster["tetrad_size_error"] < 2 and faster["tetrad_shape_error"] > 0.01
-    alone = path_statistics(Paths(), [2], TETRADS, LENGTH)
+    alone = path_statistics(Paths(), [2], TETRADS)
     assert {name for name, value in differences(alone, alone).items() if not np.isnan(value)} == {
         "acceleration_variance_error"}
 

@@ -28,7 +28,7 @@ def rollout(model=(0.0, 0.5, 1.0, 1.5), truth=(0.0, 0.5, 1.0), flow=(0.0, 1.0, 1
     spectra = {name: dict(enumerate(energies(times, 6, factor)))
                for name, times, factor in (("model", model, 1.2), ("truth", truth, 0.9))}
     table = {"time": np.array(flow), "wavenumber": np.arange(shells), "filtered": energies(flow, shells)}
-    return Rollout({"start_time": 1.0}, Still(model, broken), Still(truth), 2 * np.pi, table, {}, spectra, None)
+    return Rollout({"start_time": 1.0}, Still(model, broken), Still(truth), table, {}, spectra, None)
 
 
 def test_spectra_at_a_common_frame():

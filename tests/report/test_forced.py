@@ -33,8 +33,7 @@ def rollout(factors=FACTORS):
     gradients = {name: {frame: Invariants.of(factor * gradient) for frame, factor in enumerate(run.factors)}
                  for name, run in runs.items()}
     flow = {"time": runs["model"].times}
-    return Rollout(attributes, *runs.values(), 2 * np.pi, flow, {"filter_width": WIDTH}, spectra,
-                   gradients), columns
+    return Rollout(attributes, *runs.values(), flow, {"filter_width": WIDTH}, spectra, gradients), columns
 
 
 def stationary():

@@ -55,7 +55,7 @@ def _at_the_end(run: Rollout) -> Mapping[str, float | None]:
         "velocity_kl_floor": sampling_floor(velocity, EDGES["velocity"]),
         "acceleration_kl": pdf_divergence(acceleration, EDGES["acceleration"]),
         "acceleration_kl_floor": sampling_floor(acceleration, EDGES["acceleration"]),
-        **differences(*of_both(run.model, run.truth, run.common, run.length)),
+        **differences(*of_both(run)),
     }
     for name, both in drifts(run).items():
         measures |= {name: both["model"], f"{name}_floor": both["truth"]}

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eddies.analysis.errors import rms_log_ratio
-from eddies.analysis.rollout import CommonFrames, Frames
+from eddies.analysis.rollout import Frames, Rollout
 from eddies.parallel.migration import wrap
 
 if TYPE_CHECKING:
@@ -54,12 +54,10 @@ class PathStatistics:
     tetrad_shape: np.ndarray
 
 
-def of_both(model: Frames, truth: Frames, common: CommonFrames,
-            length: float) -> tuple[PathStatistics, PathStatistics]:
+def of_both(run: Rollout) -> tuple[PathStatistics, PathStatistics]:
     """Statistics of model and truth over all common frames. Both use the tetrads of the truth in the first frame."""
-    tetrads = near_tetrads(truth.read(int(common.truth[0]), "position"), length)
-    return (path_statistics(model, common.model, tetrads, length),
-            path_statistics(truth, common.truth, tetrads, length))
+    tetrads = near_tetrads(run.pair(0, "position").truth, run.length)
+    return path_statistics(run.model, run.common.model, tetrads), path_statistics(run.truth, run.common.truth, tetrads)
 
 
 def evenly(total: int, most: int) -> np.ndarray:
@@ -90,7 +88,7 @@ def near_tetrads(position: np.ndarray, length: float) -> np.ndarray:
     return tree.query(tree.data[evenly(len(position), TETRADS)], CORNERS)[1].T
 
 
-def path_statistics(run: Frames, chosen: Sequence[int], tetrads: np.ndarray, length: float) -> PathStatistics:
+def path_statistics(run: Frames, chosen: Sequence[int], tetrads: np.ndarray) -> PathStatistics:
     """Statistics of the chosen frames of a run; `tetrads` (4, g) holds row numbers of its particles."""
     chosen = [int(frame) for frame in chosen]
     times = run.times[chosen] - run.times[chosen[0]]
@@ -101,7 +99,7 @@ def path_statistics(run: Frames, chosen: Sequence[int], tetrads: np.ndarray, len
         np.array([correlation(velocity[0], later) for later in velocity]),
         _over_lags(acceleration, lags, correlation),
         np.array([np.var(values, dtype=float) for values in acceleration]),
-        *_dispersion(run, chosen, tetrads, length))
+        *_dispersion(run, chosen, tetrads))
 
 
 def differences(model: PathStatistics, truth: PathStatistics) -> dict[str, float]:
@@ -132,11 +130,11 @@ def _sample(run: Frames, chosen: Sequence[int], column: str) -> np.ndarray:
     return np.stack([run.read(frame, column)[::every] for frame in chosen])
 
 
-def _dispersion(run: Frames, chosen: Sequence[int], tetrads: np.ndarray,
-                length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _dispersion(run: Frames, chosen: Sequence[int],
+                tetrads: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pair dispersion (m,) of the first two corners of tetrads, tetrad size (m,) and shape (m, 3) in chosen frames."""
     first = np.tile(tetrads[0], CORNERS - 1)
-    paths = separations((run.read(frame, "position") for frame in chosen), tetrads[1:].ravel(), first, length)
+    paths = separations((run.read(frame, "position") for frame in chosen), tetrads[1:].ravel(), first, run.length)
     pairs, sizes, shapes, start = [], [], [], None
     for separation in paths:
         corners = np.concatenate([np.zeros((1, tetrads.shape[1], 3)), separation.reshape(CORNERS - 1, -1, 3)])

@@ -101,7 +101,6 @@ class Rollout:
     attributes : attributes of the group `rollout` in rollout.h5.
     model, truth : particles, at times since the start of the rollout. The truth may end before the model. Without a
         ground truth, `truth` has no frames, and `without_truth` gives the reason.
-    length : edge of the box.
     flow : table `spectra` of the ground truth, with `energy` and `filtered`. Its times and `start_time` count from the
         release of the tracers.
     reference : scales of the ground truth.
@@ -119,7 +118,6 @@ class Rollout:
     attributes: Mapping[str, float | str]
     model: Frames
     truth: Frames
-    length: float
     flow: Table
     reference: Mapping[str, float]
     spectra: Mapping[str, Mapping[int, np.ndarray]]
@@ -129,6 +127,11 @@ class Rollout:
     closure: Table | None = None
     without_truth: str = ""
     reconstructed_by: str = ""
+
+    @property
+    def length(self) -> float:
+        """Edge of the box."""
+        return self.model.length
 
     @property
     def turnover(self) -> float:

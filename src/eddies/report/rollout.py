@@ -221,7 +221,7 @@ def _add_spectra(shown: Section, run: Rollout, main: bool) -> None:
 
 def _add_paths(shown: Section, run: Rollout, main: bool) -> None:
     """Add Lagrangian statistics over all common frames."""
-    model, truth = of_both(run.model, run.truth, run.common, run.length)
+    model, truth = of_both(run)
     errors = differences(model, truth)
     shown.metrics += [Metric(key, MEASURES[key], value, "it needs several frames") for key, value in errors.items()]
     if not main:

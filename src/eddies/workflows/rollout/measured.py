@@ -242,7 +242,7 @@ def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
             "outside_training": read_table(file, "outside_training")["share"] if "outside_training" in file else None,
             "closure": read_table(file, "closure") if "closure" in file else None}
         if truth_file is None:
-            yield MeasuredRollout(Rollout(attributes, model, NOTHING, model.length, {}, {}, {}, None, **tables,
+            yield MeasuredRollout(Rollout(attributes, model, NOTHING, {}, {}, {}, None, **tables,
                                           without_truth=missing), provenance, directory)
             return
         ground = GroundTruth(truth_file, alone)
@@ -260,6 +260,6 @@ def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
                           for name, run in both.items()}
             planes = {name: OnDemand(lambda frame, run=run: Plane(*fields.plane(run, frame)))
                       for name, run in both.items()}
-        rollout = Rollout(attributes, model, truth, model.length, read_table(truth_file, "spectra"), ground.reference,
+        rollout = Rollout(attributes, model, truth, read_table(truth_file, "spectra"), ground.reference,
                           spectra, invariants, planes, **tables, reconstructed_by=fields.form.words if fields else "")
         yield MeasuredRollout(rollout, provenance, directory, fields, solver, "stationary" in truth_file)
