@@ -55,6 +55,7 @@ def test_what_is_read_is_what_was_written(comm, tmp_path, monkeypatch, mpi):
     _, modes, rows = arrays(comm, 200)
     assert (saved["time"], saved["end"]) == (200 / 3, np.inf) and saved.files == []
     assert set(saved) == {"time", "end", "seconds", "modes", "position", "table", "nothing"} and len(saved) == 7
+    assert "modes" in saved and "time" in saved and "mode" not in saved
     assert np.allclose(saved["table"], arrays(comm, 200)[0]["table"] - comm.rank) and saved["seconds"] == 1
     assert np.array_equal(saved.read("modes"), modes) and saved.read("modes").dtype == np.complex128
     assert np.array_equal(saved.read("modes", 2, 5, axis=2), modes[:, :, 2:5])

@@ -77,6 +77,9 @@ class Checkpoint(Mapping):
         with open_to_read(self.path) as file:
             yield from [*self.content["values"], *(name for name in file if name != PLAIN)]
 
+    def __contains__(self, name: object) -> bool:
+        return name in list(self)  # reads no array, unlike the method of Mapping
+
     def __len__(self) -> int:
         return sum(1 for _ in self)
 
