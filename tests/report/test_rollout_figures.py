@@ -7,7 +7,7 @@ from eddies.analysis.against_truth import InvariantStatistics
 from eddies.analysis.rollout import Plane
 from eddies.analysis.velocity_gradients import ConditionalVelocity, Invariants
 from eddies.report.figures import png
-from eddies.report.rollout_figures import invariant_plane, velocity_planes
+from eddies.report.rollout_figures import errors_over_time, invariant_plane, velocity_planes
 
 
 @pytest.mark.parametrize("particles", [8, 27, 64, 1000])
@@ -31,3 +31,13 @@ def test_planes_are_as_large_with_few_frames(frames):
     png(figure)
     width = figure.axes[0].get_position().width * figure.get_figwidth()
     assert width == pytest.approx(2.05, abs=0.06)
+
+
+def test_the_density_is_drawn_if_model_and_truth_have_one():
+    time = np.arange(3.0)
+    without = {"time": time, "energy": time + 1}
+    dense = without | {"density_rms": time}
+    errors = dict.fromkeys(("time", "velocity_error", "no_force", "velocity_kl", "acceleration_kl"), time)
+    for model, truth, panels in ((dense, dense, 4), (dense, without, 3), (without, dense, 3)):
+        titles = [axis.get_title(loc="left")[4:] for axis in errors_over_time(model, truth, errors, 1.0).axes]
+        assert titles == ["Kinetic energy", "Velocity error", "PDF divergence", "Density fluctuation"][:panels]

@@ -10,10 +10,8 @@ import h5py
 import pytest
 
 from eddies import cli
-from eddies.analysis.against_truth import error_series, particle_series
 from eddies.io.hdf5 import ProductError
 from eddies.parallel.stop import Stopped
-from eddies.report.rollout_figures import errors_over_time
 from eddies.scene.scene import load_scene
 from eddies.workflows import dns, report
 from eddies.workflows.rollout.measured import open_rollout
@@ -117,22 +115,6 @@ def test_a_run_without_density_shows_everything_else(comm, tmp_path):
     assert METRICS["rollout"] <= metrics["rollout"].keys() and None not in metrics["rollout"].values()
     assert "density_rms" not in metrics["ground_truth"] and "density_drift" not in metrics["rollout"]
     assert "an incompressible fluid has none" in page
-
-
-@pytest.mark.parametrize("of_model, of_truth", [(True, True), (True, False), (False, True)])
-def test_the_density_is_drawn_if_model_and_truth_have_one(comm, tmp_path, of_model, of_truth):
-    write_run(comm, tmp_path, {"density": of_truth}, density=of_model)
-    with open_rollout(tmp_path, comm) as measured:
-        run = measured.rollout
-        series = [particle_series(frames, range(6)) for frames in (run.model, run.truth)]
-        errors = error_series(run)
-        spread = run.model.read(2, "density").std() if of_model else None
-    assert ["density_rms" in run for run in series] == [of_model, of_truth]
-    assert not of_model or series[0]["density_rms"][2] == spread
-    figure = errors_over_time(*series, errors, 1.0)
-    titles = [axis.get_title(loc="left") for axis in figure.axes]
-    assert titles == ["A   Kinetic energy", "B   Velocity error", "C   PDF divergence", "D   Density fluctuation"][
-        :4 if of_model and of_truth else 3]
 
 
 @pytest.mark.usefixtures("no_figures")
