@@ -15,10 +15,10 @@ from eddies.io.weights import load_weights
 from eddies.scene.scene import load_scene
 from eddies.workflows import product_warnings, simulate
 from eddies.workflows.rollout.measured import TrueParticles, open_rollout
-from eddies.workflows.rollout.particle_measures import FieldsOfParticles, ParticleSpectra
 from eddies.workflows.variants import rollouts, steps
 from tests.commands import run_cli
 from tests.small_scene import TINY
+from tests.workflows.counting import count_measures
 
 SMALLER = ["flow.cells=16", "flow.viscosity=0.1", "spin_up.turnovers=0.3", "tracers.particles_per_side=8",
            "tracers.field_cells=12", "tracers.frame_interval=0.1", "tracers.field_every=1", "kernel.neighbors=30",
@@ -243,22 +243,18 @@ def test_realisations_that_no_training_has_seen(comm, folder, monkeypatch):
     together measure and read each truth once, for any number of variants and pages."""
     measured, scanned, alone = [], [], comm.Split(comm.rank)
 
-    def counted(method):
-        def measure(self, particles, frame, *more):
-            if isinstance(particles, TrueParticles):
-                path = os.path.realpath(particles._tracers._group.file.filename)
-                measured.append((type(self).__name__, path, int(particles.frames[frame])))
-            return method(self, particles, frame, *more)
-        return measure
+    def noted(quantity, particles, frame):
+        if isinstance(particles, TrueParticles):
+            path = os.path.realpath(particles._tracers._group.file.filename)
+            measured.append((quantity, path, int(particles.frames[frame])))
 
     with monkeypatch.context() as patch:
-        for cls, method in ((FieldsOfParticles, "gradients"), (ParticleSpectra, "of")):
-            patch.setattr(cls, method, counted(getattr(cls, method)))
+        count_measures(patch, noted)
         patch.setattr(product_warnings, "stored_numbers", lambda file: scanned.append(file.filename) or ())
         assert run_cli("run", "unseen.toml", "--output", "out") == 0
     together = [each for some in comm.allgather(measured) for each in some]
     assert len(set(together)) == len(together) and len({path for _, path, _ in together}) == 2
-    assert {name for name, *_ in together} == {"FieldsOfParticles", "ParticleSpectra"}
+    assert {name for name, *_ in together} == {"gradients", "spectrum"}
     read = [os.path.realpath(path) for path in scanned]
     assert len(set(read)) == len(read) > 0
     out = folder / "out"

@@ -11,8 +11,8 @@ from eddies.io.hdf5 import ProductError, open_product
 from eddies.io.trajectories import Trajectory
 from eddies.workflows.rollout import particle_measures
 from eddies.workflows.rollout.measured import TrueParticles, open_rollout
-from eddies.workflows.rollout.particle_measures import FieldsOfParticles, ParticleSpectra
 from tests.changed_product import changed
+from tests.workflows.counting import count_measures
 from tests.workflows.synthetic_run import START, write_kernel, write_rollout, write_run
 
 
@@ -30,15 +30,10 @@ def work(monkeypatch):
     """A list of all measures that are made, as pairs of "model" or "truth" and frame."""
     done = []
 
-    def counted(method, whose):
-        def measure(self, particles, frame, *more):
-            done.append((whose(particles), frame))
-            return method(self, particles, frame, *more)
-        return measure
+    def noted(quantity, particles, frame):
+        done.append(("truth" if isinstance(particles, TrueParticles) else "model", frame))
 
-    for cls, method in ((FieldsOfParticles, "gradients"), (ParticleSpectra, "of")):
-        monkeypatch.setattr(cls, method, counted(getattr(cls, method), lambda particles: "truth" if isinstance(
-            particles, TrueParticles) else "model"))
+    count_measures(monkeypatch, noted)
     return done
 
 

@@ -7,8 +7,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import ReferenceScales
 from eddies.particles.forms import Form
 from eddies.particles.smoothing_kernels import CubicSpline
-from eddies.workflows.rollout.particle_measures import (FieldsOfParticles, ParticleSpectra, ReconstructedFields,
-                                                        WithGradients)
+from eddies.workflows.rollout.particle_measures import ParticleSpectra, ReconstructedFields, WithGradients
 from tests.particles.configurations import positions
 from tests.validation import filtered_fields
 
@@ -87,8 +86,8 @@ def test_averages_of_a_linear_flow_are_that_flow_away_from_its_jump(comm):
             self.position, self.velocity = place, (place - LENGTH / 2) @ rotation.T
 
     form = Form("average", CubicSpline(2.2 * SPACING), 2 * SPACING, SPACING**3)
-    averages = FieldsOfParticles(form, SlabDecomposition(comm, LENGTH, SIDE))
-    particles, fields = WithGradients(Rotating(), averages), ReconstructedFields(Rotating(), averages)
+    fields = ReconstructedFields(Rotating(), form, SlabDecomposition(comm, LENGTH, SIDE))
+    particles = WithGradients(Rotating(), fields)
     assert particles.columns == ("position", "velocity", "velocity_gradient") and fields.cells == SIDE
     inside = np.flatnonzero(np.abs(place - LENGTH / 2).max(axis=1) < LENGTH / 4)
     assert np.array_equal(particles.read(2, "velocity"), Rotating().read(2, "velocity"))
@@ -101,7 +100,7 @@ def test_averages_of_a_linear_flow_are_that_flow_away_from_its_jump(comm):
     quarter = slice(SIDE // 3, 2 * SIDE // 3)
     assert field[0][:, quarter, quarter] == pytest.approx(
         np.broadcast_to(-1.5 * grid[None, quarter, None], field[0][:, quarter, quarter].shape), abs=1e-5)
-    velocity, vorticity = averages.plane(Rotating(), 0)
+    velocity, vorticity = fields.plane(0)
     assert velocity == pytest.approx(field[:, SIDE // 2], abs=1e-5)
     assert vorticity[quarter, quarter] == pytest.approx(2 * gradient[inside][0][1, 0], rel=0.2)
     assert np.array_equal(particles.read(1, "velocity_gradient", 5, 9), particles.read(1, "velocity_gradient")[5:9])

@@ -22,8 +22,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.devices import prepare_torch
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import load_form
-from eddies.workflows.rollout.particle_measures import (GRADIENT, FieldsOfParticles, ParticleSpectra,
-                                                        ReconstructedFields, WithGradients)
+from eddies.workflows.rollout.particle_measures import GRADIENT, ParticleSpectra, ReconstructedFields, WithGradients
 
 log = logging.getLogger("eddies")
 
@@ -110,16 +109,16 @@ class MeasuredRollout:
     ----------
     rollout : the rollout and its truth. provenance : provenance of rollout.h5.
     directory : the run directory.
-    fields : reconstructs fields of particles; None if the kernel or the ground truth is missing.
+    fields : the fields of "model" and "truth"; empty if the kernel or the ground truth is missing.
     solver : makes spectra of particles; None without a ground truth.
     stationary : whether the ground truth has a stationary state.
     """
 
     def __init__(self, rollout: Rollout, provenance: Mapping[str, Any], directory: Path,
-                 fields: FieldsOfParticles | None = None, solver: ParticleSpectra | None = None,
+                 fields: Mapping[str, ReconstructedFields], solver: ParticleSpectra | None = None,
                  stationary: bool = False) -> None:
         self.rollout, self.provenance, self._directory = rollout, provenance, directory
-        self.fields, self._solver, self._stationary = fields, solver, stationary
+        self._fields, self._solver, self._stationary = fields, solver, stationary
 
     @property
     def particles(self) -> dict[str, Any]:
@@ -131,11 +130,11 @@ class MeasuredRollout:
     def exported(self) -> dict[str, dict[str, Any]]:
         """Under "fields" and "particles": a mapping from "model" and "truth" to their series. Without a kernel, there
         are no fields, and particles have no velocity gradients."""
-        fields, runs = self.fields, self.particles
-        if fields is None:
-            return {"fields": {}, "particles": runs}
-        return {"fields": {name: ReconstructedFields(run, fields) for name, run in runs.items()},
-                "particles": {name: WithGradients(run, fields) for name, run in runs.items()}}
+        if not self._fields:
+            return {"fields": {}, "particles": self.particles}
+        fields = {name: self._fields[name] for name in self.particles}
+        return {"fields": fields,
+                "particles": {name: WithGradients(run, fields[name]) for name, run in self.particles.items()}}
 
     @property
     def groups(self) -> dict[str, Any]:
@@ -145,10 +144,9 @@ class MeasuredRollout:
             if self._solver is not None:
                 found[f"spectra_of_{name}"] = ComputedSeries(run.times, "energy",
                                                              self.rollout.spectra[name].__getitem__)
-            if self.fields is not None:
-                found[f"fields/{name}"] = ReconstructedFields(run, self.fields)
-                found[f"gradients/{name}"] = ComputedSeries(
-                    run.times, GRADIENT, lambda frame, run=run: self.fields.gradients(run, frame))
+            if self._fields:
+                found[f"fields/{name}"] = self._fields[name]
+                found[f"gradients/{name}"] = ComputedSeries(run.times, GRADIENT, self._fields[name].gradients)
         return found
 
     def measure(self, comm: Comm, root: int = 0, page: bool = True, every_frame: bool = True,
@@ -168,9 +166,8 @@ class MeasuredRollout:
         new = [task for task in tasks if self._key(task) not in known]
         own = on_all_ranks(comm, lambda: {(quantity, of, frame): getattr(self.rollout, quantity)[of][frame]
                                           for quantity, of, frame in new[comm.rank::comm.size]}, ProductError)
-        for maker in (self._solver, self.fields):
-            if maker is not None:
-                maker.forget()  # many rollouts are open at a time
+        for maker in (self._solver, *self._fields.values()):
+            maker.forget()  # many rollouts are open at a time
         for task in new:
             if task[1] == "truth":
                 known[self._key(task)] = own.get(task)
@@ -200,14 +197,14 @@ class MeasuredRollout:
             return []
         every = np.arange(len(common.times))
         chosen = {"spectra": run.shown_spectra(every_frame) if page else np.intersect1d(run.spectral(), every[-1])}
-        if self.fields is not None:
+        if self._fields:
             chosen["invariants"] = every if every_frame else every[-1:]
             chosen["planes"] = common.spread(PLANES if page else 0)
         tasks = [(quantity, of, int(frame)) for quantity, rows in chosen.items()
                  for of, frames in (("model", common.model), ("truth", common.truth)) for frame in frames[rows]]
         if page and run.forced and self._stationary:
             tasks += [("spectra", "model", int(frame)) for frame in run.late_spectra()]
-            if self.fields is not None:
+            if self._fields:
                 tasks += [("invariants", "truth", 0), *(("invariants", "model", int(frame)) for frame in run.late)]
         return list(dict.fromkeys(tasks))
 
@@ -243,23 +240,20 @@ def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
             "closure": read_table(file, "closure") if "closure" in file else None}
         if truth_file is None:
             yield MeasuredRollout(Rollout(attributes, model, NOTHING, {}, {}, {}, None, **tables,
-                                          without_truth=missing), provenance, directory)
+                                          without_truth=missing), provenance, directory, {})
             return
         ground = GroundTruth(truth_file, alone)
         truth = TrueParticles(ground.trajectory, attributes["start_time"], model.times)
-        kernel, fields = directory / "kernel.h5", None
-        if kernel.exists():
+        both, fields, words = {"model": model, "truth": truth}, {}, ""
+        if (directory / "kernel.h5").exists():
             slab = SlabDecomposition(alone, model.length, ground.fields.cells)
-            fields = FieldsOfParticles(load_form(alone, kernel, ground.scales), slab)
+            form = load_form(alone, directory / "kernel.h5", ground.scales)
+            fields, words = {name: ReconstructedFields(run, form, slab) for name, run in both.items()}, form.words
         solver = ParticleSpectra(ground.scales, model.length, alone)
-        both = {"model": model, "truth": truth}
         spectra = {name: OnDemand(lambda frame, name=name: solver.of(both[name], frame, name)) for name in both}
-        invariants = planes = None
-        if fields is not None:
-            invariants = {name: OnDemand(lambda frame, run=run: Invariants.of(fields.gradients(run, frame)))
-                          for name, run in both.items()}
-            planes = {name: OnDemand(lambda frame, run=run: Plane(*fields.plane(run, frame)))
-                      for name, run in both.items()}
+        invariants = {name: OnDemand(lambda frame, own=own: Invariants.of(own.gradients(frame)))
+                      for name, own in fields.items()}
+        planes = {name: OnDemand(lambda frame, own=own: Plane(*own.plane(frame))) for name, own in fields.items()}
         rollout = Rollout(attributes, model, truth, read_table(truth_file, "spectra"), ground.reference,
-                          spectra, invariants, planes, **tables, reconstructed_by=fields.form.words if fields else "")
+                          spectra, invariants or None, planes or None, **tables, reconstructed_by=words)
         yield MeasuredRollout(rollout, provenance, directory, fields, solver, "stationary" in truth_file)

@@ -22,39 +22,42 @@ MOST_ITERATIONS = 100  # largest number in a solve for a spectrum, see ParticleS
 GRADIENT = "velocity_gradient"
 
 
-class FieldsOfParticles:
-    """Fields that a method of reconstruction computes from particles. The results for the last frame are kept.
+class ReconstructedFields:
+    """A series of fields: the velocity that a form reconstructs from particles on a grid, in the layout of a
+    `FieldSeries`. Results for the last frame are kept.
 
     Parameters
     ----------
-    form : the method of reconstruction. slab : the box on one rank; the grid of the fields has its planes. Grid point i
-        is at i L / planes.
+    slab : the box on one rank; the grid of the fields has its planes. Grid point i is at i L / planes.
     """
 
-    def __init__(self, form: Form, slab: SlabDecomposition) -> None:
-        self.form, self.slab = form, slab
-        self._kept: dict[str, tuple[Any, Any]] = {}  # by name: particles and frame of the last call, and its result
+    variables = columns = ("velocity",)
 
-    def gradients(self, particles: Frames, frame: int) -> np.ndarray:
+    def __init__(self, particles: Frames, form: Form, slab: SlabDecomposition) -> None:
+        self.particles, self.form, self.slab = particles, form, slab
+        self.times, self.cells = particles.times, slab.planes
+        self._kept: dict[str, tuple[int, Any]] = {}  # by name: frame of the last call, and its result
+
+    def read(self, index: int, variable: str, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Read planes start, ..., stop - 1, (3, stop - start, y, x)."""
+        whole = self._once("velocity", index, lambda: self._by_component(self.form.on_grid(self._field(index)), 3))
+        return whole[:, start:stop]
+
+    def gradients(self, frame: int) -> np.ndarray:
         """Velocity gradients (n, 3, 3) [component, direction] at the particles."""
         def made() -> np.ndarray:
-            field = self._field(particles, frame)
+            field = self._field(frame)
             return as_numpy(self.form.at(field, field.owned)[1])
 
-        return self._once("gradients", particles, frame, made)
+        return self._once("gradients", frame, made)
 
-    def velocity(self, particles: Frames, frame: int) -> np.ndarray:
-        """The velocity (3, z, y, x) on the grid."""
-        return self._once("velocity", particles, frame,
-                          lambda: self._by_component(self.form.on_grid(self._field(particles, frame)), 3))
-
-    def plane(self, particles: Frames, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    def plane(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Velocity (3, y, x) and magnitude of the vorticity (y, x) at the grid points in the plane z = pi."""
         axis = torch.arange(self.slab.planes, dtype=torch.float64) * self.slab.spacing
         y, x = torch.meshgrid(axis, axis, indexing="ij")
         middle = torch.full_like(x, self.slab.planes // 2 * self.slab.spacing)
         points = torch.stack([x, y, middle], -1).reshape(-1, 3)
-        velocity, gradient = self.form.at(self._field(particles, frame), points)
+        velocity, gradient = self.form.at(self._field(frame), points)
         antisymmetric = gradient - gradient.transpose(1, 2)  # its norm is sqrt(2) times the vorticity
         vorticity = antisymmetric.square().sum((1, 2)).div(2).sqrt()
         return self._by_component(velocity, 2), as_numpy(vorticity).reshape([self.slab.planes] * 2)
@@ -63,18 +66,18 @@ class FieldsOfParticles:
         """Free the results that are kept."""
         self._kept.clear()
 
-    def _once(self, name: str, particles: Frames, frame: int, make: Callable[[], Any]) -> Any:
-        key = id(particles), frame
-        if name not in self._kept or self._kept[name][0] != key:
-            self._kept[name] = key, make()
+    def _once(self, name: str, frame: int, make: Callable[[], Any]) -> Any:
+        if name not in self._kept or self._kept[name][0] != frame:
+            self._kept[name] = frame, make()
         return self._kept[name][1]
 
-    def _field(self, particles: Frames, frame: int) -> ParticleField:
+    def _field(self, frame: int) -> ParticleField:
         def made() -> ParticleField:
-            position, velocity = (torch.from_numpy(particles.read(frame, name)) for name in ("position", "velocity"))
+            position, velocity = (torch.from_numpy(self.particles.read(frame, name))
+                                  for name in ("position", "velocity"))
             return ParticleField(self.slab, self.form.support, position, velocity)
 
-        return self._once("field", particles, frame, made)
+        return self._once("field", frame, made)
 
     def _by_component(self, velocity: torch.Tensor, dimensions: int) -> np.ndarray:
         return as_numpy(velocity).T.reshape(3, *[self.slab.planes] * dimensions)
@@ -83,29 +86,15 @@ class FieldsOfParticles:
 class WithGradients:
     """Particles with one more column, the reconstructed `velocity_gradient` dv_i/dx_j."""
 
-    def __init__(self, particles: Any, fields: FieldsOfParticles) -> None:
+    def __init__(self, particles: Any, fields: ReconstructedFields) -> None:
         self._particles, self._fields, self.times = particles, fields, particles.times
         self.total, self.length, self.columns = particles.total, particles.length, (*particles.columns, GRADIENT)
 
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Read rows start, ..., stop - 1 of a column, in order of id."""
         if column == GRADIENT:
-            return self._fields.gradients(self._particles, frame)[start:stop]
+            return self._fields.gradients(frame)[start:stop]
         return self._particles.read(frame, column, start, stop)
-
-
-class ReconstructedFields:
-    """A series of fields: the velocity that is reconstructed from particles on a grid."""
-
-    variables = columns = ("velocity",)
-
-    def __init__(self, particles: Frames, fields: FieldsOfParticles) -> None:
-        self._particles, self._fields, self.times = particles, fields, particles.times
-        self.cells = fields.slab.planes
-
-    def read(self, index: int, variable: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Read planes start, ..., stop - 1, (3, stop - start, y, x)."""
-        return self._fields.velocity(self._particles, index)[:, start:stop]
 
 
 class ParticleSpectra:
