@@ -74,9 +74,7 @@ def made(comm, directory, *overrides, runs=("own",)):
         (directory / "own.toml").write_text(SCENE)
     comm.Barrier()
     for seed, name in enumerate(runs, 1):
-        if comm.rank == 0:
-            (directory / name).mkdir()
-        comm.Barrier()
+        (directory / name).mkdir(exist_ok=True)
         dns.run(scene_of(directory, *overrides, f"seed={seed}"), comm, directory / name)
     return scene_of(directory, *overrides)
 
