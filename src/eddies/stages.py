@@ -35,7 +35,7 @@ from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.learned.source import ModelDefinition, read_source
 from eddies.workflows.problems import Context, check_ground_truth, memory_of_node, problems
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
-from eddies.workflows.run_directory.work import FAILURE, SECONDS, find_work, stage_seconds
+from eddies.workflows.run_directory.work import FAILURE, SECONDS, find_work, link_products, stage_seconds
 from eddies.workflows.variants import Step, steps
 
 log = logging.getLogger("eddies")
@@ -111,7 +111,9 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
             with (recording_failure(failures, step.variant, step.directory, comm),
                   working_in(comm, step.directory, stop, take_over) if inner else nullcontext()):
                 if inner:
-                    in_files(comm, step.directory, step.link)
+                    linked = {holder / STAGES[stage].file: stage_fingerprint(step.scene, stage)
+                              for stage, holder in step.links.items()}
+                    in_files(comm, step.directory, partial(link_products, linked, step.directory))
                     prepare_directory(step.scene.to_toml(), comm, step.directory)
                 run_step(step, comm, stop, overwrite)
         if reported:

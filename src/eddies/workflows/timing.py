@@ -35,6 +35,8 @@ from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.learned.training_data import training_data
 from eddies.workflows.learned.training_phases import training_phases
 from eddies.workflows.learned.truths import open_truths
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint
+from eddies.workflows.run_directory.work import link_products
 from eddies.workflows.variants import steps
 
 log = logging.getLogger("eddies")
@@ -79,7 +81,9 @@ def run(scene: Scene, comm: Comm, signals: Sequence[int] = ()) -> None:
                 few = shortened(scene, reference["eddy_turnover_time"])
             for step in steps(few, scene.stages_of_all, directory):
                 whole = scene.variant[step.variant] if step.variant else scene.without_variants
-                in_files(comm, step.directory, step.link)
+                linked = {holder / STAGES[stage].file: stage_fingerprint(step.scene, stage)
+                          for stage, holder in step.links.items()}
+                in_files(comm, step.directory, partial(link_products, linked, step.directory))
                 for stage in step.stages:
                     name = f"{step.variant}: {stage}" if step.variant else stage
                     measure = partial(wall_time_of, stage, step.scene, whole, step.directory, stop)

@@ -14,12 +14,10 @@ Each directory is a complete run directory: products that are made elsewhere wit
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from eddies.io.provenance import product_fingerprint
 from eddies.pipeline import STAGES
 from eddies.scene.scene import REALISATION, Scene
 from eddies.workflows.run_directory.fingerprints import set_files, stage_fingerprint
@@ -50,19 +48,6 @@ class Step:
     variant: str | None = None
     links: Mapping[str, Path] = field(default_factory=dict)
     files: tuple[Path, ...] = ()
-
-    def link(self) -> None:
-        """Make the directory, and in it relative links to the products of other directories. One rank calls it.
-
-        A product made with the settings of the step is kept; any other is replaced.
-        """
-        self.directory.mkdir(parents=True, exist_ok=True)
-        for stage, holder in self.links.items():
-            path, product = self.directory / STAGES[stage].file, holder / STAGES[stage].file
-            if path.is_symlink() or product_fingerprint(path) != stage_fingerprint(self.scene, stage):
-                path.unlink(missing_ok=True)
-                if product.exists():
-                    path.symlink_to(os.path.relpath(product.resolve(), self.directory.resolve()))
 
 
 def rollouts(scene: Scene, directory: Path) -> dict[str, dict[Path, Scene]]:

@@ -4,6 +4,7 @@ continued; other work would be replaced."""
 from __future__ import annotations
 
 import json
+import os
 import tomllib
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
@@ -19,7 +20,7 @@ from eddies.io.checkpoint import checkpoints_in
 from eddies.io.checksums import open_to_read
 from eddies.io.errors import ContentError, ProductError
 from eddies.io.hdf5 import open_product, read_attributes, read_table
-from eddies.io.provenance import product_provenance
+from eddies.io.provenance import product_fingerprint, product_provenance
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.layers import dotted
@@ -110,6 +111,21 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
     if not overwrite:
         work.refuse_to_lose()
     return work
+
+
+def link_products(products: Mapping[Path, str], directory: Path) -> None:
+    """Make a directory, and in it relative links to those products of other directories that exist. One rank calls it.
+
+    `products` are the paths with the fingerprints of their settings. A product that the directory holds itself is kept
+    if it has this fingerprint, and else removed.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    for product, fingerprint in products.items():
+        path = directory / product.name
+        if path.is_symlink() or product_fingerprint(path) != fingerprint:
+            path.unlink(missing_ok=True)
+            if product.exists():
+                path.symlink_to(os.path.relpath(product.resolve(), directory.resolve()))
 
 
 def _scene_of(directory: Path) -> str | None:
