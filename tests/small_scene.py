@@ -33,5 +33,6 @@ def scene_error(make: Callable[..., Any], *arguments: Any) -> str:
 
 def problems_of(scene: Scene, comm) -> tuple[list[str], list[str]]:
     """Refusals and warnings of all stages of a scene."""
-    from eddies.workflows.problems import context_here, problems
-    return problems(scene, context_here(scene.stages_of_all, scene.directory, comm))
+    from eddies.workflows.problems import problems
+    from eddies.workflows.variants import steps
+    return problems(scene, steps(scene, scene.stages_of_all, scene.directory), comm)

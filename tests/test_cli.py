@@ -131,12 +131,13 @@ def test_input_of_other_settings_is_refused(comm, tmp_path, capfd):
 @pytest.mark.mpi(2)
 def test_more_ranks_than_slabs_are_refused_before_any_work(comm, tmp_path, capfd):
     """The ground truth alone may use more ranks than the other stages."""
-    from eddies.workflows.problems import Context, problems
+    from eddies.workflows.problems import problems
+    from eddies.workflows.variants import steps
     refused(comm, capfd, ["run", TINY, "--set", "tracers.field_cells=6", "--output", tmp_path / "run"],
             "2 ranks are more than the limit of 1 (ghost planes of the filtered fields)")
     assert not (tmp_path / "run").exists()
     scene = load_scene(TINY, ["tracers.field_cells=6"])
-    assert problems(scene, Context(comm, ["dns"], tmp_path))[0] == []
+    assert problems(scene, steps(scene, ["dns"], tmp_path), comm)[0] == []
 
 
 @pytest.mark.mpi(1)

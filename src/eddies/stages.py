@@ -33,7 +33,7 @@ from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.foreseen.storage import in_units
 from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.learned.source import ModelDefinition, read_source
-from eddies.workflows.problems import Context, check_ground_truth, memory_of_node, problems
+from eddies.workflows.problems import check_ground_truth, directory_problems, memory_of_node, problems
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 from eddies.workflows.run_directory.work import FAILURE, SECONDS, find_work, link_products, stage_seconds
 from eddies.workflows.variants import Step, steps
@@ -78,8 +78,8 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     if not scene.variant or not planned and not reported:
         for each in [scene.variant[name] for name in variants] or [scene]:
             each.check_stages(stages)
-    refused, warnings = problems(scene, Context(comm, stages, directory, variants, memory_of_node(comm)))
-    for problem in refused:
+    refused, warnings = problems(scene, planned, comm, memory_of_node(comm))
+    for problem in [*refused, *(directory_problems(("report",), comm, directory) if reported else ())]:
         raise SceneError(problem)
 
     def refuse_to_lose() -> None:

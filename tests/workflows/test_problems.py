@@ -13,7 +13,8 @@ from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 from eddies.scene.terms import FilteredEquations, StepUnits
 from eddies.workflows.foreseen.storage import storage
 from eddies.workflows.ground_truth.frame_counts import check_frames
-from eddies.workflows.problems import Context, check_ground_truth, convenient, memory_of_node, problems
+from eddies.workflows.problems import check_ground_truth, convenient, memory_of_node, problems
+from eddies.workflows.variants import steps
 from tests.bad_scenes import INFEASIBLE
 from tests.changed_product import changed
 from tests.small_scene import TINY, one_model, problems_of
@@ -159,11 +160,11 @@ def test_weights_that_the_same_job_makes_are_not_read(comm, tmp_path, monkeypatc
 @pytest.mark.mpi(1, 2)
 def test_a_machine_that_is_too_small(comm, tmp_path):
     scene = load_scene(TINY)
-    fits = Context(comm, scene.stages, tmp_path, memory=memory_of_node(comm), free_disk=1e9)
-    assert problems(scene, fits) == ([], [])
-    size = storage(scene, "dns", comm.size).memory
-    (small,) = problems(scene, dataclasses.replace(fits, stages=["dns"], memory=(comm.size - 0.5) * size))[1]
-    (full,) = problems(scene, dataclasses.replace(fits, free_disk=1e6))[1]
+    planned, memory = steps(scene, scene.stages, tmp_path), memory_of_node(comm)
+    assert problems(scene, planned, comm, memory, 1e9) == ([], [])
+    too_little = (comm.size - 0.5) * storage(scene, "dns", comm.size).memory
+    (small,) = problems(scene, steps(scene, ["dns"], tmp_path), comm, too_little, 1e9)[1]
+    (full,) = problems(scene, planned, comm, memory, 1e6)[1]
     assert "of memory here" in small and "of disk" in full
 
 
@@ -212,7 +213,7 @@ def test_only_the_stages_that_are_asked_for_are_refused(comm, tmp_path):
     scene = load_scene(TINY, ["simulation.step=1e-12", "tracers.turnovers=0.01"])
     for stages, text in ((["dns", "train-kernel"], None), (["dns", "train"], "window"), (["train"], None),
                          (["simulate"], "step = 1e-12")):
-        refused, _ = problems(scene, Context(comm, stages, tmp_path))
+        refused, _ = problems(scene, steps(scene, stages, tmp_path), comm)
         assert len(refused) == (text is not None) and (text is None or text in refused[0])
 
 

@@ -14,7 +14,7 @@ from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.foreseen.ranks import most_ranks
 from eddies.workflows.foreseen.seconds import seconds
 from eddies.workflows.foreseen.storage import Storage, in_units, most_disk, storage
-from eddies.workflows.problems import context_here, problems
+from eddies.workflows.problems import directory_problems, free_disk_at, memory_of_node, problems
 from eddies.workflows.variants import rollouts, steps
 
 log = logging.getLogger("eddies")
@@ -50,11 +50,12 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
     """Return all estimates, with the keys that docs/check.md describes; None if unknown. All ranks call it."""
     expected, tracers, k_max = estimate(scene), scene.tracers, scene.flow.largest_wavenumber
     rollout_of = {name: estimate(each).rollout for name, each in (scene.variant or {scene.name: scene}).items()}
-    context = context_here(scene.stages_of_all, scene.directory, comm)
-    (refusals, warnings), limits, turbulence = problems(scene, context), most_ranks(scene), expected.turbulence
+    planned = steps(scene, scene.stages_of_all, scene.directory)
+    refusals, warnings = problems(scene, planned, comm, memory_of_node(comm), free_disk_at(scene.directory, comm))
+    of_report, limits = directory_problems(("report",), comm, scene.directory), most_ranks(scene)
+    turbulence = expected.turbulence
     # Scenes by variant (None: shared by all variants) and stage. With realisations a stage has several scenes.
     work: dict[tuple[str | None, str], list[Scene]] = {}
-    planned = steps(scene, scene.stages_of_all, scene.directory)
     for step in sorted(planned, key=lambda step: [None, *scene.variant].index(step.variant)):
         for stage in step.stages:
             work.setdefault((step.variant, stage), []).append(step.scene)
@@ -84,7 +85,7 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
         "totals": {"seconds": sum(row["seconds"] or 0.0 for row in costs),
                    "memory": max(row["memory"] for row in costs), "disk": sum(row["disk"] or 0.0 for row in costs),
                    "most_disk": most_disk(needs)},
-        "warnings": warnings, "refusals": refusals,
+        "warnings": warnings, "refusals": [*dict.fromkeys([*refusals, *of_report])],
     }
 
 

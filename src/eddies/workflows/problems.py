@@ -7,7 +7,6 @@ import math
 import os
 import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -30,7 +29,7 @@ from eddies.workflows.foreseen.storage import Storage, in_units, most_disk, stor
 from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.ground_truth.scene_flow import given_spectrum, stored_states
 from eddies.workflows.learned.source import ModelDefinition, read_source
-from eddies.workflows.variants import Step, steps
+from eddies.workflows.variants import Step
 
 LARGEST_MACH = 0.3           # turbulent Mach number; relative density fluctuations are about its square
 LEAST_REYNOLDS = 5.0         # Re_lambda above which large scales transfer energy to small ones
@@ -42,31 +41,10 @@ LOG_NEGLIGIBLE_ENERGY = -40.0  # logarithm of the share of the energy below whic
 LARGEST_TURNOVER_RATIO, TURBULENT = 3.0, 20.0
 
 
-@dataclass(frozen=True)
-class Context:
-    """The ranks, machine and run directory of a run.
-
-    Parameters
-    ----------
-    comm : the ranks that run the stages.
-    stages, directory, variants : arguments of `eddies.stages.run_stages`.
-    memory : memory of each node in bytes; if infinite, it is not checked.
-    free_disk : free bytes on the disk of the run directory; if infinite, the disk is not checked.
-    """
-
-    comm: Comm
-    stages: Sequence[str]
-    directory: Path
-    variants: Sequence[str] = ()
-    memory: float = math.inf
-    free_disk: float = math.inf
-
-
-def context_here(stages: Sequence[str], directory: Path, comm: Comm) -> Context:
-    """Return the context of stages in a run directory on this machine; all ranks call it."""
+def free_disk_at(directory: Path, comm: Comm) -> float:
+    """Free bytes on the disk of a directory, which need not exist; all ranks call it."""
     place = next(path for path in (directory, *directory.parents) if path.is_dir())
-    free = on_first_rank(comm, lambda: shutil.disk_usage(place).free)
-    return Context(comm, stages, directory, memory=memory_of_node(comm), free_disk=free)
+    return float(on_first_rank(comm, lambda: shutil.disk_usage(place).free))
 
 
 def memory_of_node(comm: Comm) -> float:
@@ -74,12 +52,13 @@ def memory_of_node(comm: Comm) -> float:
     return float(global_min(comm, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")))
 
 
-def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
-    """Return two lists of problems of the stages of a scene and of its variants; all ranks call it and get the same.
+def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = math.inf,
+             free_disk: float = math.inf) -> tuple[list[str], list[str]]:
+    """Return two lists of problems of the planned steps of a scene; all ranks call it and get the same.
 
-    `eddies run` refuses the scene if the first list is not empty. The second list holds warnings.
+    `eddies run` refuses the scene if the first list is not empty. The second list holds warnings. `memory` of a node
+    and `free_disk` are in bytes; what is infinite is not checked.
     """
-    comm, planned = context.comm, steps(scene, context.stages, context.directory, context.variants)
     on_node = node_ranks(comm)
     made = {file for step in planned for file in step.files}
     refused: dict[str, None] = {}
@@ -99,17 +78,15 @@ def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
             doubts.setdefault(doubt, []).append(step.variant or "")
         for stage in stages:
             needs.append(storage(own, stage, comm.size))
-            if on_node * needs[-1].memory > context.memory:
+            if on_node * needs[-1].memory > memory:
                 doubts[f"{stage}: {on_node} ranks with about {in_units(needs[-1].memory)} each need more than the "
-                       f"{in_units(context.memory)} of memory here; take more nodes, or fewer cells or particles"] = []
-    if "report" in context.stages:
-        refused |= dict.fromkeys(directory_problems(("report",), comm, context.directory))
+                       f"{in_units(memory)} of memory here; take more nodes, or fewer cells or particles"] = []
     needed = most_disk(needs)
     if scene.sets and scene.kernel is not None and not scene.variant:
         doubts[f"[tracers] set: is absent, so that only the ground truths of {', '.join(scene.sets)} are made; "
                "choose one of them for kernel, model and rollout"] = []
-    if needed > context.free_disk:
-        doubts[f"the stages need about {in_units(needed)} of disk, and {in_units(context.free_disk)} are free here; "
+    if needed > free_disk:
+        doubts[f"the stages need about {in_units(needed)} of disk, and {in_units(free_disk)} are free here; "
                "choose another --output, or raise [tracers] frame_interval or field_every"] = []
     named = {text: ", ".join(dict.fromkeys(filter(None, names))) for text, names in doubts.items()}
     return [*refused], [f"variant {names}: {text}" if names else text for text, names in named.items()]

@@ -21,7 +21,8 @@ from eddies.workflows.ground_truth.frame_counts import last_seen, rollout_start
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.learned.training_data import load_frame, model_for, training_data
 from eddies.workflows.learned.truths import open_truths, truth_problems
-from eddies.workflows.problems import Context, problems
+from eddies.workflows.problems import problems
+from eddies.workflows.variants import steps
 from eddies.workflows.rollout.method import forcing_of, make_method
 from tests.changed_product import changed
 from tests.workflows.small_rollout import with_method
@@ -247,7 +248,7 @@ def test_unfit_truths_are_refused_before_any_work(comm, tmp_path):
         """The problem with another ground truth. The run makes its own, which [training] truths names too."""
         own = tmp_path / "new"
         scene = trained_on(scene, own, *others)
-        refused, _ = problems(scene, Context(comm, ("train",), own))
+        refused, _ = problems(scene, steps(scene, ("train",), own), comm)
         assert any(problem.startswith("own: [training] truths: ") for problem in refused)
         found, = truth_problems(scene.training, scene.tracers, scene.model.reads, own / "ground_truth.h5", comm)
         assert found.startswith(f'[training] truths: "{others[-1]}"')
