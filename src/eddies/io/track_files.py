@@ -25,7 +25,7 @@ from zipfile import BadZipFile
 import h5py
 import numpy as np
 
-from eddies.io.errors import ProductError, file_errors
+from eddies.io.errors import ProductError, read_errors
 from eddies.io.new_files import create_export
 from eddies.io.trajectories import ROUNDING, write_h5md_header
 
@@ -93,11 +93,11 @@ def read_tracks(path: str | Path, layout: str | None = None, group: str | None =
     path = Path(path)
     if not path.is_file():
         raise ProductError(f"{path}: no such file; give the path of a file with particle tracks")
-    layout = layout or _layout_of(path)
-    if layout not in LAYOUTS:
-        raise ProductError(f"{path}: layout = {layout!r}: must be one of {', '.join(LAYOUTS)}")
     try:
-        with file_errors(path):
+        with read_errors(path):
+            layout = layout or _layout_of(path)
+            if layout not in LAYOUTS:
+                raise ProductError(f"{path}: layout = {layout!r}: must be one of {', '.join(LAYOUTS)}")
             found = LAYOUTS[layout](path, group, interval)
     except UNREADABLE as error:
         text = " ".join(str(error.args[0] if error.args else error).split())
@@ -150,7 +150,7 @@ def _layout_of(path: Path) -> str:
     """The layout of a file by its suffix. An HDF5 file is "h5md" if it has /particles, else "lagrangebench"."""
     suffix = path.suffix.lower()
     if suffix in (".h5", ".hdf5", ".h5md"):
-        with _opened(path) as file:
+        with h5py.File(path) as file:
             return "h5md" if "particles" in file else "lagrangebench"
     if suffix in SUFFIXES:
         return SUFFIXES[suffix]
@@ -159,7 +159,7 @@ def _layout_of(path: Path) -> str:
 
 
 def _read_h5md(path: Path, group: str | None, interval: float | None) -> Tracks:
-    with _opened(path) as file:
+    with h5py.File(path) as file:
         holder = _chosen(path, file.get("particles", {}), group, "groups of particles")
         element = holder["position"]
         position = element["value"][()]
@@ -187,7 +187,7 @@ def _read_npz(path: Path, group: str | None, interval: float | None) -> Tracks:
 
 def _read_lagrangebench(path: Path, group: str | None, interval: float | None) -> Tracks:
     metadata = json.loads((path.parent / "metadata.json").read_text(encoding="utf-8"))
-    with _opened(path) as file:
+    with h5py.File(path) as file:
         position = _chosen(path, file, group, "trajectories")["position"][()]
     lower, upper = np.transpose(metadata["bounds"])
     times = float(metadata["dt"]) * int(metadata.get("write_every", 1)) * np.arange(len(position))
@@ -214,14 +214,6 @@ LAYOUTS: Mapping[str, Callable[[Path, str | None, float | None], Tracks]] = {
     "h5md": _read_h5md, "npz": _read_npz, "lagrangebench": _read_lagrangebench, "csv": _read_csv}
 # Errors that numpy, h5py and json raise for a file whose content does not fit the layout.
 UNREADABLE = (KeyError, ValueError, TypeError, IndexError, AttributeError, EOFError, BadZipFile, zlib.error)
-
-
-def _opened(path: Path) -> h5py.File:
-    try:
-        return h5py.File(path, "r")
-    except OSError as error:
-        raise ProductError(f"{path}: cannot be opened as HDF5 ({' '.join(str(error).split())}); the file may be "
-                           "truncated") from None
 
 
 def _chosen(path: Path, holder: Mapping[str, Any], name: str | None, what: str) -> Any:
