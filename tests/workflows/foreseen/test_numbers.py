@@ -13,8 +13,7 @@ from eddies.scene.scene import Time, load_scene
 from eddies.workflows.foreseen.numbers import estimate, rollout_in
 from eddies.workflows.foreseen.seconds import START, seconds
 from eddies.workflows.foreseen.storage import (FLOW_PROCESS, TORCH_PROCESS, Storage, flow_memory, most_disk,
-                                               rollout_bytes, storage, trajectory_bytes)
-from eddies.workflows.ground_truth.frame_counts import unfiltered_frames
+                                               storage)
 from eddies.workflows.problems import _large_files
 from tests.small_scene import one_model
 
@@ -89,7 +88,7 @@ def folder(comm, tmp_path_factory):
 @pytest.mark.parametrize("overrides", [
     [], ["simulation.step=0.3"], ["simulation.integrator=verlet", "simulation.step=0.02"],
     ["simulation.integrator=rk4", "simulation.step=0.007"], ["simulation.method=eulerian", "simulation.step=0.015"]])
-def test_runs_take_the_steps_and_bytes_that_are_expected(comm, folder, overrides, monkeypatch):
+def test_rollouts_take_the_steps_that_are_expected(comm, folder, overrides, monkeypatch):
     from eddies.workflows import simulate
     shown = []
     monkeypatch.setattr(ProgressLine, "__call__", lambda self, done, step: shown.append((done, step)))
@@ -101,14 +100,6 @@ def test_runs_take_the_steps_and_bytes_that_are_expected(comm, folder, overrides
     assert (rollout.steps, rollout.intervals) == (found["steps"], frames - 1)
     assert rollout.time_step == pytest.approx(found["time_step"])
     assert rollout.evaluations == found.get("evaluations", 0)
-    with h5py.File(folder / "ground_truth.h5") as file:
-        frames = len(file["particles/tracers/time"])
-    flow, tracers = scene.flow, scene.tracers
-    whole = len(unfiltered_frames(scene.simulation, scene.training, tracers.field_every, frames))
-    # A third of files this small is headers and text.
-    for name, size in (("rollout", rollout_bytes(tracers.particles, rollout.intervals + 1)),
-                       ("ground_truth", trajectory_bytes(flow, tracers, frames, whole))):
-        assert (folder / f"{name}.h5").stat().st_size == pytest.approx(size, rel=0.5)
     # The progress line is called after every step, not only at frames.
     assert [step for _, step in shown] == list(range(1, rollout.steps + 1))
     assert all(0 < done <= 1 for done, _ in shown)
