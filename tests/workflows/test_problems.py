@@ -243,6 +243,22 @@ def test_files_that_do_not_fit(comm, tmp_path):
     assert f"{path}/model.h5" in line
 
 
+@pytest.mark.mpi(1)
+def test_names_that_are_taken_in_the_run_directory(comm, tmp_path, capfd):
+    """The report has a directory and no product."""
+    (tmp_path / "ground_truth.h5").mkdir()
+    for name in ("checkpoints", "report"):
+        (tmp_path / name).touch()
+    scene = load_scene(TINY)
+    first, second = problems(scene, steps(scene, ["dns"], tmp_path), comm)[0]
+    assert "ground_truth.h5: is a directory, and `eddies dns` writes a file" in first
+    assert "checkpoints: is a file, and `eddies dns` makes a directory" in second
+    (tmp_path / "ground_truth.h5").rmdir()
+    (tmp_path / "checkpoints").unlink()
+    assert eddies("run", TINY, "--output", tmp_path) == 2
+    assert "report: is a file, and `eddies report` makes a directory" in capfd.readouterr().err
+
+
 # ---- what only the flow tells
 
 
