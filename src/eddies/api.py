@@ -80,9 +80,9 @@ def simulate(scene: Scene | str | Path, *, output: str | Path | None = None, ove
 def _job(comm: Comm | None) -> Iterator[Comm]:
     """Context that gives the communicator of a job, by default the one of all ranks.
 
-    Log lines go to standard output unless the program has set up logging. With several ranks, MPI_Abort ends the job
-    in two cases. Either only some ranks meet an error, and the others may wait for them. Or HDF5 could not write a
-    file, and would crash at exit.
+    Log lines go to standard output unless the program has set up logging. With several ranks, an error ends the job by
+    MPI_Abort in two cases: if only some ranks raise it, because the others may wait for them; and if HDF5 could not
+    write a file, because it would crash at exit.
     """
     default_to_one_thread()
     from mpi4py import MPI

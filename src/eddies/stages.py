@@ -88,7 +88,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
                 find_work, step.stages, step.scene, step.directory, step.links, overwrite))
 
     if take_over:
-        refuse_to_lose()  # a command that is refused must not end another job
+        refuse_to_lose()  # before another job is ended
     else:
         refuse_if_held(comm, directory)
     made = {file for step in planned for file in step.files}
@@ -107,7 +107,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
                 continue
             if len(planned) > 1:
                 log.info("%s, part %d of %d: %s", step.directory, number, len(planned), ", ".join(step.stages))
-            inner = step.directory != directory  # with a lock of its own
+            inner = step.directory != directory  # this directory has a lock of its own
             with (recording_failure(failures, step.variant, step.directory, comm),
                   working_in(comm, step.directory, stop, take_over) if inner else nullcontext()):
                 if inner:
@@ -125,8 +125,8 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
 
 @contextmanager
 def recording_failure(failures: dict[str, str], variant: str | None, directory: Path, comm: Comm) -> Iterator[None]:
-    """Context in which an error of the user that all ranks meet ends only the work on a variant. The error is added to
-    `failures` by name of the variant, and written into its directory."""
+    """Context for the work on a variant. If all ranks raise a UserError, only this work ends, and other variants go on.
+    The error is stored in `failures` under the name of the variant, and written into its directory."""
     errors = comm.Dup()  # other ranks may wait in `comm` for a message when one rank fails
     try:
         yield
@@ -134,7 +134,7 @@ def recording_failure(failures: dict[str, str], variant: str | None, directory: 
         raise
     except UserError as error:
         if variant is None or not all_arrive(errors) or any_rank(errors, writing_failed()):
-            raise  # also if HDF5 could not write a file: the job must then be aborted
+            raise  # if HDF5 could not write a file, the job must be aborted
         failures[variant] = str(error)
         log.log(OUTCOME, "variant %s failed: %s", variant, error)
         in_files(comm, directory, lambda: write_files({directory / FAILURE: f"{failures[variant]}\n"}))
@@ -232,8 +232,10 @@ def prepare_directory(text: str, comm: Comm, directory: Path) -> None:
 
 
 def record_seconds(stage: str, seconds: float, comm: Comm, directory: Path, begun: bool) -> float:
-    """Record the wall time of a stage in stage_seconds.json and return it. If `begun` is true, the time of
-    earlier runs that began the stage is added, but not that of killed runs."""
+    """Record the wall time of a stage in stage_seconds.json and return it.
+
+    If `begun` is true, the time that earlier runs recorded for the stage is added. A killed run records no time.
+    """
     path = directory / SECONDS
 
     def record() -> float:

@@ -71,7 +71,8 @@ class InvariantStatistics:
 
     @classmethod
     def of(cls, model: Invariants, truth: Invariants) -> "InvariantStatistics":
-        """Joint PDFs of (Q, R), scaled with <Q_w> of the truth in both runs, so that a wrong model amplitude shows."""
+        """Joint PDFs of Q and R. Both runs are scaled with <Q_w> = <W_ij W_ij> / 2 of the truth. So a wrong amplitude
+        of the model changes its PDF."""
         model_plane, truth_plane = (run.normalized(truth.scale) for run in (model, truth))
         bins = InvariantBins.covering(*truth_plane)
         floor = sampling_divergence(len(truth.second),

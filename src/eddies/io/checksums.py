@@ -44,7 +44,8 @@ def open_to_read(path: str | Path) -> h5py.File:
     directory has a lock, and a product gets its name only when it is complete.
 
     Raises:
-        ContentError: it is no HDF5 file, its checksums are missing, or bytes differ from them; also at a later read.
+        ContentError: the file is missing or not an HDF5 file, its checksums are missing, or bytes differ from them.
+            Later reads raise it too.
         ProductError: the system refuses to open the file.
     """
     with read_errors(path):
@@ -70,15 +71,15 @@ class CheckedFile(io.FileIO):
         return str(self._path)  # h5py uses it as the name of the file
 
     def __del__(self) -> None:
-        self.close()  # without the warning that nobody has closed the file
+        self.close()  # else Python warns that the file was not closed
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Go to a position. The end is that of the HDF5 data, before the checksums."""
+        """Go to a position. The end of the file is the end of the HDF5 data; the checksums come after it."""
         return super().seek(offset + self._size) if whence == os.SEEK_END else super().seek(offset, whence)
 
     def readinto(self, buffer: memoryview) -> int:
-        """Fill a buffer with the bytes from the position on. ContentError if bytes differ from their checksums. The
-        position does not change: h5py sets it before each read."""
+        """Fill a buffer with the bytes from the present position on. Raises ContentError if bytes differ from their
+        checksums. The position does not change, because h5py sets it before each read."""
         at, done = self.tell(), 0
         size = min(len(buffer), self._size - at)
         while done < size:
@@ -94,7 +95,7 @@ class CheckedFile(io.FileIO):
 
 
 def add_checksums(comm: MPI.Comm, path: Path) -> None:
-    """Append checksums to a file that all ranks have closed; collective. WriteError, on all ranks, if that fails."""
+    """Append checksums to a file that all ranks have closed; collective. Raises WriteError on all ranks if it fails."""
     from eddies.parallel.broadcast import on_all_ranks, on_first_rank
     from eddies.parallel.reduction import global_sum
     comm.Barrier()  # all ranks have closed the file
@@ -128,9 +129,9 @@ def table_checksum(path: Path) -> int | None:
 def find_damage(comm: MPI.Comm, path: Path, known: int | None = None) -> str | None:
     """Compare a file with its checksums; collective.
 
-    Returns a text with file, dataset and frame of the first damage; None if the file is undamaged. `known` is
-    the result of `table_checksum` for the expected file. Raises ProductError, on all ranks, if the system refuses to
-    read the file, which may be undamaged.
+    Returns a text that names file, dataset and frame of the first damage; None if there is no damage. `known` is the
+    result of `table_checksum` for the expected file; if it is None, any file with valid checksums is accepted. Raises
+    ProductError on all ranks if the system refuses to read the file. It is then unknown whether the file is damaged.
     """
     from eddies.parallel.broadcast import on_all_ranks, on_first_rank
     from eddies.parallel.reduction import global_min

@@ -43,14 +43,14 @@ class Array(BackendArray):
 
 
 def known_array(place: str, values: np.ndarray) -> Array:
-    """An array with known values, described as the dataset at a path in rollout.h5."""
+    """An array with known values. Its attributes are those of the dataset at the path `place` in rollout.h5."""
     return Array(values.shape, values.dtype, dataset_attributes("rollout", place), values.__getitem__)
 
 
 def computed_array(place: str, shape: tuple[int, ...], dtype: np.dtype,
                    make: Callable[[Sequence[int]], Sequence[np.ndarray]]) -> Array:
-    """An array whose frames, along the first axis, are computed when they are used: `make` returns the frames with
-    these indices. It is described as the dataset at a path in rollout.h5."""
+    """An array whose frames are computed when they are used. The first axis is that of the frames, and `make` returns
+    the frames with the given indices. Attributes are those of the dataset at the path `place` in rollout.h5."""
     def read(part: tuple) -> np.ndarray:
         first, *others = part or (slice(None),)
         frames = np.arange(shape[0])[first]
@@ -96,8 +96,8 @@ def groups_in(file: h5py.File) -> list[str]:
 
 
 def as_dataset(arrays: Mapping[str, Array], attributes: Mapping[str, Any]) -> Any:
-    """An xarray Dataset of arrays by name. Times, ids, wavenumbers and points become coordinates. Without xarray, a
-    dictionary of numpy arrays."""
+    """An xarray Dataset with these arrays. Times, ids, wavenumbers and points become coordinates. If xarray is not
+    installed, a dictionary of numpy arrays."""
     if xarray is None:
         return {key: array.read(()) for key, array in arrays.items()}
     variables, coordinates = {}, {}

@@ -20,7 +20,7 @@ class ProductError(UserError, RuntimeError):
 
 
 class ContentError(ProductError):
-    """The content of a file is damaged, of another format, or gone. After other errors the file may be sound."""
+    """A file is missing, damaged or not an HDF5 file. After any other ProductError the file may be undamaged."""
 
 
 class WriteError(ProductError):
@@ -57,8 +57,8 @@ def space_in_words(path: Path | str, wanted: int) -> str:
 
 @contextmanager
 def read_errors(path: Path | str) -> Iterator[None]:
-    """Convert an OSError inside the block: to ContentError if HDF5 has found the content damaged or the file is
-    missing, and else to ProductError, because the system refuses to read the file."""
+    """Convert an OSError inside the block. It becomes a ContentError if the file is missing or HDF5 finds it damaged.
+    Otherwise the system refuses to read the file, and the error becomes a ProductError."""
     try:
         yield
     except OSError as error:

@@ -44,9 +44,9 @@ class FrameLayout:
 
     def writers(self, file: File, names: Mapping[str, str] | None = None, images: bool = False
                 ) -> tuple[dict[str, TrajectoryWriter], dict[str, FieldWriter]]:
-        """Return a dict of writers of trajectories and one of writers of fields, by name of the series; collective.
+        """Return the writers of trajectories and those of fields, as two dicts by name of the series; collective.
 
-        `names` maps each series that gets a writer to its name in the file. If it is None, all series get one, under
+        `names` maps the series that are written to their names in the file. If it is None, all series are written under
         their own names. `images` adds the column `image` to trajectories with positions.
         """
         if names is None:
@@ -95,7 +95,7 @@ class FrameSegments:
         return frames[:count]
 
     def assemble(self, file: File, names: Mapping[str, str] | None = None) -> None:
-        """Copy the frames of all segments into a product, and add the column `image`. `names` says which series, as in
+        """Copy the frames of all segments into a product, and add the column `image`. `names` selects the series as in
         `FrameLayout.writers`."""
         self.close()
         trajectories, fields = self.layout.writers(file, names, images=True)

@@ -122,7 +122,7 @@ QUANTITIES = {
 
 
 def conventions(kind: str) -> dict[str, str]:
-    """Attributes of a product with units, box and origin of time; empty for a product without a flow."""
+    """Attributes of a product that state its units, box and origin of time; empty for a product without a flow."""
     return {**CONVENTIONS, "time_origin": ORIGINS[kind]} if kind in ORIGINS else {}
 
 

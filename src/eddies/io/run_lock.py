@@ -104,7 +104,7 @@ class FoundLock:
 
     @property
     def silent(self) -> float:
-        """Seconds since the last sign of life."""
+        """Seconds since the last sign of life of the job that holds the lock."""
         return _now(self.directory) - self.sign
 
     @property

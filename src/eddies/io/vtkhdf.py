@@ -131,5 +131,5 @@ def _point_offsets(frames: int, total: int, names: Iterable[str]) -> dict[str, n
 
 
 def _offsets_of(name: str) -> str:
-    """The name, in the group Steps, of the offsets of a dataset."""
+    """The name of the dataset in the group Steps that holds the offsets of the dataset `name`."""
     return "PointOffsets" if name == "Points" else name.replace("PointData/", "PointDataOffsets/")

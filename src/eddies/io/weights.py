@@ -45,7 +45,8 @@ def save_weights(comm: MPI.Comm, path: str | Path, kind: str, description: Mappi
 
 
 def load_weights(comm: MPI.Comm, path: str | Path, kind: str) -> StoredWeights:
-    """Read what `save_weights` wrote, on all ranks; collective. ProductError also if a tensor is not finite."""
+    """Read what `save_weights` wrote, on all ranks; collective. Raises ProductError if the file cannot be used or a
+    tensor is not finite."""
     with open_product(comm, path, kind) as file:
         tables = {name: read_table(file, name) for name in file if name != "weights"}
         stored = StoredWeights(Path(path), read_json(file, "description"), read_table(file, "weights"), tables,

@@ -1,8 +1,8 @@
 """Copies before and after the one-dimensional passes of a slab transform.
 
 Along an axis of `cells` points a transform keeps the modes 0 ... K at the beginning of its array and -K ... -1 at the
-end. The gap between them stays zero. Arrays that are used many times are `Described` once, because numpy returns
-addresses slowly. Arrays must be contiguous and of the given precision; ValueError otherwise.
+end. The gap between them stays zero. Arrays that are used many times are `Described` once, because numpy takes long
+to return an address. Arrays must be contiguous and of the given precision; ValueError otherwise.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class Blocks(ctypes.Structure):
 class Described:
     """An array with its address, shape and strides.
 
-    The array must be contiguous or, with `gaps`, each of its parts along the first axis. `apart` is the number of
-    elements from the beginning of one part to the beginning of the next.
+    The array must be contiguous. If `gaps` is true, only its parts array[i] must be contiguous. `apart` is the number
+    of elements from the beginning of one part to the beginning of the next.
     """
 
     def __init__(self, array: np.ndarray, gaps: bool = False) -> None:
@@ -91,11 +91,11 @@ class ColumnCopies(_Copies):
         self._store(*sizes, column.address, scale, start)
 
     def send(self, column: Described, blocks: Blocks, component: int, rows: slice) -> None:
-        """Copy a column to blocks."""
+        """Copy a column to a component of the blocks, at some `rows`."""
         self._exchange(self._send, column, blocks, component, rows)
 
     def receive(self, blocks: Blocks, component: int, rows: slice, column: Described) -> None:
-        """Copy blocks to a column."""
+        """Copy a component of the blocks, at some `rows`, to a column."""
         self._exchange(self._receive, column, blocks, component, rows)
 
     def _sizes(self, modes: Described, component: int, rows: slice, column: Described) -> tuple[tuple[int, ...], int]:

@@ -87,11 +87,12 @@ class CompiledPairs:
 
     def gradients(self, summands: Sequence[Summand], parameters: Sequence[np.ndarray], by_sums: Sequence[np.ndarray],
                   columns: bool) -> tuple[list[np.ndarray], tuple[np.ndarray, ...]]:
-        """Return the gradients of a loss with respect to each of `parameters`, and to (position, velocity, scalars).
+        """Return the gradients of a loss with respect to each of `parameters`, and those with respect to position,
+        velocity and scalars as a tuple.
 
-        The second result is an empty tuple unless `columns` is true. `by_sums` are the gradients of the loss with
-        respect to the sums, zero at particles that are not wanted. Raises ValueError as `sums` does, and if a summand
-        has no gradient.
+        `by_sums` are the gradients of the loss with respect to the sums (components, n) of each summand. They must be
+        zero at particles that are not wanted. The tuple is empty unless `columns` is true. Raises ValueError as `sums`
+        does, and if a summand has no gradient.
         """
         by_parameters = [np.zeros(len(values)) for values in parameters]
         by_columns = tuple(np.empty_like(column) for column in self._columns[:3]) if columns else ()

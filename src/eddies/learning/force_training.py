@@ -153,7 +153,8 @@ class TrainingFrame:
 
     @torch.no_grad()
     def seen(self) -> ParticleSet:
-        """The particles with the density that the model's terms read; collective."""
+        """This rank's particles. If terms of the model give a density, it replaces the stored one, because other terms
+        read it. Collective."""
         rates = self.dynamics.rates(self.particles, self._row_of_sorted[:0], self.kept)
         return self.particles if rates.density is None else replace(self.particles, density=rates.density)
 

@@ -188,7 +188,10 @@ class Context:
             self._sums |= zip(rest, self._torch_sums(rest))
 
     def _compiled_request(self, summand: PairSum) -> CompiledSum | None:
-        """The sum for the compiled library; None if the library has no such sum or does not support the device."""
+        """Description of a sum for the compiled library.
+
+        None if the sum has no compiled form, or if the library does not support the device.
+        """
         request = vars(type(summand)).get("compiled")
         return request(summand, self) if request and kernels_serve(self.particles.position.device) else None
 
@@ -229,8 +232,8 @@ class Context:
 
 
 def _values(summand: PairSum, pairs: ScaledPairs) -> Tensor:
-    """Values of the pairs for a sum. Raises TermError, which names the class, if `pair_values` fails or has a wrong
-    result."""
+    """Values (components, m) of a summand for m pairs. Raises TermError, which names the class, if `pair_values` fails
+    or returns anything but real numbers of this shape."""
     with users_code(type(summand), TermError):
         values = summand.pair_values(pairs)
     count = len(pairs.pairs.distance)

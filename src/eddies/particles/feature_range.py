@@ -44,9 +44,9 @@ class FeatureRange:
         return cls(global_min(comm, np.min(low, axis=0)), global_max(comm, np.max(high, axis=0)))
 
     def share_outside(self, comm: Comm, blocks: Iterable[Tensor]) -> float:
-        """Share of pairs with a NaN or a feature outside the range, in blocks (features, m) of all ranks; collective.
+        """Share of the pairs that have a NaN or a feature outside the range; zero if there are no pairs. Collective.
 
-        It is zero without pairs.
+        `blocks` (features, m) hold the pairs of this rank, and the share is that of the pairs of all ranks.
         """
         counts = np.zeros(2, np.int64)
         for block in blocks:

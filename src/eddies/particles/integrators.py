@@ -88,11 +88,12 @@ class CorrectedVerlet(Integrator):
 
 
 class RungeKutta(Integrator):
-    """An explicit Runge-Kutta scheme. Each stage begins at the start of the step, with the rates of the stage before:
+    """An explicit Runge-Kutta scheme. Each stage advances the state y(t) with the rates f of the previous stage:
 
         k_s = f(y + c_s dt k_(s-1)),    y(t + dt) = y + dt sum_s b_s k_s,
 
-    with nodes c and weights b. Particles change rank between stages. `memory` holds rates only after a call of `rates`.
+    with nodes c and weights b. Particles may change rank between stages. A step leaves `memory` empty, and a call of
+    `rates` fills it.
     """
 
     def __init__(self, dynamics: ParticleDynamics, scheme: Scheme) -> None:

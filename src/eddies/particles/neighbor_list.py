@@ -101,7 +101,8 @@ class NeighborList:
                 for axis, (x, y) in enumerate(zip(receivers.unbind(1), senders.unbind(1)))]
 
     def _listed(self, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Receiver, output row and sender of each listed pair of some receivers (k,)."""
+        """Receiver, output row and sender of each listed pair of the receivers `numbers` (k,). The output row of a pair
+        is the index of its receiver in `numbers`."""
         length = self.offsets[numbers + 1] - self.offsets[numbers]
         segment = torch.repeat_interleave(torch.arange(len(numbers), device=numbers.device), length)
         shift = self.offsets[numbers] - (length.cumsum(0) - length)

@@ -53,7 +53,9 @@ class Pairs:
         return gather_rows(column, self.sender)
 
     def sum(self, values: Tensor) -> Tensor:
-        """Sum of pair values (components, m) over the pairs of each output row, in a fixed order: (components, count).
+        """Sum the values (components, m) of the pairs of each output row: (components, count).
+
+        The order of summation is fixed.
         """
         return _SegmentSum.apply(values, self.offsets, self.segment)
 
@@ -67,7 +69,8 @@ def gather_rows(column: Tensor, index: Tensor) -> Tensor:
 
 
 class _SegmentSum(torch.autograd.Function):
-    """Sums of consecutive columns of a (components, m) array. On a CPU numpy's sum is the fastest."""
+    """Sums of the columns of a (components, m) array within each segment. Segment i has the columns offsets[i], ...,
+    offsets[i + 1] - 1. On a CPU numpy's sum is the fastest."""
 
     @staticmethod
     def forward(ctx, values: Tensor, offsets: Tensor, segment: Tensor) -> Tensor:

@@ -69,7 +69,7 @@ class ResolvedFlow:
         return self.grid.at(modes, self.points)
 
     def missing(self) -> Tensor:
-        """Unresolved part (n, 3) of the particles' velocities relative to their mean; collective."""
+        """Unresolved velocity (n, 3): `relative_velocity` minus the resolved velocity at the particles; collective."""
         if self.left_over is not None:
             return self.left_over
         return self.relative_velocity - self.at_particles(self.velocity).to(self.relative_velocity)

@@ -162,25 +162,27 @@ class HermiteKernel:
 
 
 class KernelNetwork(nn.Module):
-    """The learned kernel: W(r) = alpha exp(NN(2 q^2 - 1)) g(q), where q = r/h and alpha makes the integral one. With a
-    `mean_volume`, W(r) = NN(q) g(q) / h^3 instead, Eq. 7 as published.
+    """The learned kernel in one of two forms, with q = r/h, a network NN and a cutoff g.
+
+    positive form : W(r) = alpha exp(NN(2 q^2 - 1)) g(q), where alpha makes the integral of W one.
+    published form, Eq. 7 : W(r) = NN(q) g(q) / h^3, which may be negative.
 
     Parameters
     ----------
     support : h.
     hidden : widths of the tanh layers.
     cutoff : "smooth": g = (1 - q^2)^2, zero with zero slope at q = 1; or "sigmoid", the paper's
-        g = 1/(1 + exp(C (q - 1))), which is 1/2 at q = 1, so the kernel ends with a jump.
+        g = 1/(1 + exp(C (q - 1))) with C = SIGMOID_SHARPNESS, which is 1/2 at q = 1, so the kernel ends with a jump.
     seed : seed of the initial weights.
-    mean_volume : L^3/N, for the published form of W, which may be negative; None for the positive form.
+    mean_volume : L^3/N for N particles, selects the published form; None for the positive form.
 
-    In the published form alpha is part of the output layer, and the loss L_n of Eq. 11 brings the integral near one.
-    Normalised averages with volumes 1/sum W would fail in the published form: alpha has no effect on them, and their
-    denominators pass zero where weights of both signs cancel. With positive weights an average of particles' values
-    lies between these values.
+    In the published form the output layer contains alpha, and the loss L_n of Eq. 11 brings the integral near one. This
+    form must not be used for averages that are normalised by the sum of W. They do not depend on alpha, and the sum
+    passes zero where positive and negative weights cancel. With positive weights an average lies between the smallest
+    and the largest of the averaged values.
 
-    The positive form is an even function of q, smooth and without slope at r = 0, as the gradient of a reconstructed
-    field requires. Its output layer starts small, so W starts near the bell g.
+    The positive form is an even function of q. It is smooth and has no slope at r = 0, as the gradient of a
+    reconstructed field requires. Its output layer starts small, so W starts near the bell g.
     """
 
     def __init__(self, support: float, hidden: Sequence[int] = (20, 20, 20, 20), cutoff: str = "smooth", seed: int = 1,
@@ -233,7 +235,7 @@ class KernelNetwork(nn.Module):
 
 
 def integral(kernel: SmoothingKernel) -> Tensor:
-    """Integral of a kernel over space, 4 pi int r^2 W dr, exact for its polynomials."""
+    """Integral of a kernel over space, 4 pi int r^2 W dr. The integral of each polynomial piece is exact."""
     pieces = kernel.pieces
     end = torch.arange(1, len(pieces) + 1, dtype=pieces.dtype, device=pieces.device).unsqueeze(1)
     power = torch.arange(1, pieces.shape[1] + 1, dtype=pieces.dtype, device=pieces.device)

@@ -62,9 +62,9 @@ def problem_of_name(variant: str) -> str:
 
 
 def check_foreign(paths: Iterable[tuple[str, str]]) -> Problems:
-    """Yield a problem if an import path cannot be loaded, or its class lacks an attribute. `Model` checks the terms.
+    """Yield a problem for each import path that cannot be loaded, or whose class does not fit its key.
 
-    `paths` has a pair of key and import path for each.
+    `paths` are pairs (key, import path). Further checks of terms are in `Model`.
     """
     for key, path in paths:
         try:
@@ -129,7 +129,8 @@ def check_time(time: Time, flow: Flow, forcing: Forcing | None, spin_up: SpinUp 
 
 
 def check_tracers(tracers: Tracers, flow: Flow, initial: Initial, variants: Collection[str]) -> Problems:
-    """Yield problems of an initial flow at rest, of fields on a finer grid than the flow's, and of names of sets."""
+    """Yield a problem if the flow starts from rest, if the name of a set of tracers is invalid, or if a filtered field
+    has more cells than the flow."""
     if initial.flow.sound:
         yield "initial.kind", ("starts from rest and has no turnover time, the unit of [tracers] turnovers; choose "
                                "another kind, or remove [tracers]")
@@ -146,8 +147,8 @@ def check_tracers(tracers: Tracers, flow: Flow, initial: Initial, variants: Coll
 
 def check_particles(tracers: Tracers, kernel: Kernel | None, model: Model | None, simulation: Simulation | None,
                     present: Collection[str]) -> Problems:
-    """Yield a problem if tracers follow the unfiltered velocity in a scene with a kernel, a model or a rollout, or if a
-    radius of neighbours with its skin is at least half the edge of the cube."""
+    """Yield a problem if a scene with a kernel, a model or a rollout has tracers that follow the unfiltered velocity.
+    Yield a problem if the radius of neighbours plus the skin is at least half the edge of the cube."""
     made = [f"[{name}]" for name in ("kernel", "model", "training", "simulation") if name in present]
     if not tracers.filtered and made:
         yield "tracers.filtered", ("these particles follow the unfiltered velocity, but kernels, models and rollouts "
@@ -156,7 +157,7 @@ def check_particles(tracers: Tracers, kernel: Kernel | None, model: Model | None
     for name, section in (("kernel", kernel), ("model", model)):
         neighbors = section.neighbors if section else None
         reach = tracers.radius_of(neighbors or 0.0) * (1 + (simulation.skin if simulation else 0.0))
-        if reach >= math.pi:  # a particle would interact with another one and its periodic image
+        if reach >= math.pi:  # a particle could interact with two periodic images of another one
             yield f"{name}.neighbors", (
                 f"with {tracers.particles} particles radius and skin together are {reach:.3g}, but must be less than "
                 f"half the cube, {math.pi:.3g}; lower neighbors or raise [tracers] particles_per_side")

@@ -192,7 +192,7 @@ class Scene(Section):
 
     @property
     def tracers_resolving(self) -> Tracers | None:
-        """Tracers that would resolve the modes of [reconstruction] in one frame; None without this section."""
+        """Tracers, so many that one frame of them would resolve the modes of [reconstruction]; None without it."""
         if self.reconstruction is None or self.tracers is None:
             return None
         return self.reconstruction.resolving(self.tracers, (self.tracks or self.tracers).filtered)
@@ -258,7 +258,7 @@ class Scene(Section):
                                          f"{seed} from realisations")
 
     def _problems(self) -> checks.Problems:
-        """Yield the problems of names, of sections that do not fit together, and of variants, each with its key."""
+        """Run the cross-checks of names, sections and variants. Yield each problem that they find, as (key, text)."""
         flow, tracers, kernel, model, simulation = self.flow, self.tracers, self.kernel, self.model, self.simulation
         present = {field.name for field in fields(self) if getattr(self, field.name) is not None}
         yield from checks.check_names(self.name, self.seed, self.realisations or (), bool(simulation or self.variant))
@@ -328,7 +328,8 @@ class Scene(Section):
         return "\n".join(lines) + "\n"
 
     def differences(self, name: str) -> Iterator[str]:
-        """Yield the lines of a variant's table: `unset`, and `key = value` for each key that differs from the scene."""
+        """Yield the lines of a variant's table: `key = value` for each key that differs from the scene. If the variant
+        lacks keys of the scene, the first line is `unset` with their names."""
         own, other = ({key: value for key, value in dotted(tomllib.loads("\n".join(write_section(scene))))
                        if key not in SCENE_ONLY_KEYS} for scene in (self.without_variants, self.variant[name]))
         held = Layer(other).keys

@@ -306,11 +306,12 @@ class Tracers(Section):
 
     @property
     def planes(self) -> int:
-        """Cells along each side of the grid of the resolved velocity; the slabs of particles end at its planes."""
+        """Cells along each side of the grid of the resolved velocity. The slabs of particles consist of whole planes of
+        this grid."""
         return planes_for(self.particles)
 
 
-#: Cells of the grid of the resolved velocity along a wave of the highest wavenumber; cubic splines can represent it.
+#: Cells of the grid of the resolved velocity per shortest resolved wavelength; cubic splines can represent this wave.
 CELLS_PER_WAVENUMBER = 7 / 3
 
 
@@ -399,11 +400,11 @@ class Reconstruction(Section):
         return self.method not in ("least-squares", "memory")
 
     def resolving(self, tracers: Tracers, filtered: bool) -> Tracers:
-        """Tracers that would resolve the modes of the reconstruction in one frame.
+        """Tracers, so many that one frame of them would resolve the modes of the reconstruction.
 
-        For a memory of an unfiltered flow these are eight times as many: it keeps modes that `tracers` determine only
-        over several frames (docs/tracks.md). For `filtered` tracks more modes gain little: undoing the filter amplifies
-        their errors.
+        These are eight times as many as `tracers` if the method is "memory" and the flow is unfiltered. The memory then
+        keeps modes that `tracers` determine only over several frames (docs/tracks.md). If the tracks are `filtered`,
+        further modes gain little, because the removal of the filter amplifies their errors.
         """
         return tracers.with_count(8 * tracers.particles) if self.method == "memory" and not filtered else tracers
 
@@ -492,7 +493,7 @@ CONVERGED = "converged"
 
 @dataclass(frozen=True, kw_only=True)
 class Simulation(Section):
-    """The run of the particles, without the direct simulation."""
+    """The rollout, in which a method moves the particles without the direct simulation."""
 
     method: str = named("method that moves the particles; see docs/baselines.md", *METHODS, default="learned")
     integrator: str | None = choice("time stepping method of the particles; absent: rk3, or with step = \"converged\" "

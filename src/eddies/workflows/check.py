@@ -91,11 +91,12 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
 
 def row(stage: str, variant: str | None, here: Sequence[Foreseen], most_ranks: int,
         there: Sequence[Foreseen]) -> dict[str, Any]:
-    """Return a row of `stage_costs`: the cost of a stage for several scenes, on these ranks and on the most ranks that
-    the stage can use (`least_seconds`, `least_memory`).
+    """Return a row of `stage_costs`: the cost of a stage for several scenes.
 
-    `seconds` (wall time) and `disk` are sums over the scenes, `memory` (bytes of a rank) is the largest. The stage
-    leaves `disk` bytes, and removes `scratch` bytes at its end.
+    `here` is the cost of each scene on the ranks of this job. `there` is the cost on `most_ranks`, the largest number
+    of ranks that the stage can use; it gives `least_seconds` and `least_memory`. Wall times and `disk` are sums over
+    the scenes; `memory`, in bytes per rank, is the largest value. The stage leaves `disk` bytes, and removes `scratch`
+    bytes at its end.
     """
     def total(values: Sequence[float | None]) -> float | None:
         return None if None in values else sum(values)

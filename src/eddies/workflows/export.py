@@ -59,7 +59,7 @@ def _export(run_directory: Path, output: Path, alone: Comm, layout: str) -> None
 
 @contextmanager
 def _opened(kind: str, run_directory: Path, alone: Comm) -> Iterator[tuple[Series, Provenance]]:
-    """Open the fields and particles that a product stores, and those that are computed of a rollout."""
+    """Open the fields and particles of a product. Those of a rollout may be computed instead of stored."""
     if kind == "rollout":
         from eddies.workflows.rollout.measured import open_rollout  # needs torch
         with open_rollout(run_directory, alone) as measured:

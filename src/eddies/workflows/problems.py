@@ -56,8 +56,8 @@ def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = 
              free_disk: float = math.inf) -> tuple[list[str], list[str]]:
     """Return two lists of problems of the planned steps of a scene; all ranks call it and get the same.
 
-    `eddies run` refuses the scene if the first list is not empty. The second list holds warnings. `memory` of a node
-    and `free_disk` are in bytes; what is infinite is not checked.
+    `eddies run` refuses the scene if the first list is not empty. The second list holds warnings. `memory` is that of a
+    node in bytes, and `free_disk` is in bytes. A value of infinity switches the check off.
     """
     on_node = node_ranks(comm)
     made = {file for step in planned for file in step.files}
@@ -96,8 +96,9 @@ def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = 
 
 
 def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
-    """Yield problems: an unstable or decayed flow, too many steps, frames, ranks or bytes, too few frames, or unfit
-    ground truths of other runs."""
+    """Yield each reason why a step cannot work: an unstable or decayed flow; too many steps, frames, ranks or bytes;
+    too few frames; or ground truths of other runs that do not fit. `made` are the files that the planned steps write.
+    """
     scene, stages, expected = step.scene, step.stages, estimate(step.scene)
     tracers, turbulence, directory = scene.tracers, expected.turbulence, step.links.get("dns", step.directory)
     truth = directory / STAGES["dns"].file
@@ -209,9 +210,10 @@ def directory_problems(stages: Sequence[str], comm: Comm, directory: Path) -> li
 
 def _unfit_files(initial: Initial | None, definition: ModelDefinition | None, name: str, device: str,
                  comm: Comm) -> Iterator[str]:
-    """Yield a problem of the files with the initial flow and with trained weights, or a missing GPU.
+    """Yield a problem if the file of the initial flow or of trained weights cannot be used, or if there is no `device`.
 
-    `initial` is None if no flow starts, `definition` if no weights are read. `name` is that of the scene.
+    `initial` is None if no flow is started, and `definition` is None if no weights are read. `name` is the name of the
+    scene.
     """
     try:
         if initial is not None and initial.flow.from_file:
@@ -232,7 +234,7 @@ def _unfit_files(initial: Initial | None, definition: ModelDefinition | None, na
 
 
 def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
-    """Warnings of the stages of a step; `made` are the files that all steps write."""
+    """Yield the warnings about the stages of a step. `made` are the files that the planned steps of the scene write."""
     scene, stages, expected = step.scene, step.stages, estimate(step.scene)
     tracers, model, training, simulation = scene.tracers, scene.model, scene.own_training, scene.simulation
     if "dns" in stages and scene.tracks is None:
@@ -392,8 +394,8 @@ def check_span(time: Time, span: float, bound: float, tracers: Tracers | None = 
 
 def check_ground_truth(path: Path, stages: Sequence[str], simulation: Simulation | None,
                        check: Callable[[int], None], comm: Comm) -> None:
-    """Raise SceneError if a ground truth does not serve `stages`: `check` finds too few frames, a scale is 0, or the
-    rollout would take too many steps; all ranks call it."""
+    """Raise SceneError if a ground truth cannot be used by `stages`; all ranks call it. The reasons are too few frames
+    (found by `check`), a scale that is 0, or a rollout with too many steps."""
     with open_product(comm, path, "ground_truth") as file:
         if "particles" not in file:  # measured tracks, none of them in all frames; only fields are made
             return

@@ -75,15 +75,19 @@ class NeighbourMethod(Method):
 
 
 class Source:
-    """Reads the particles of each frame, from measured tracks or from a ground truth; all ranks make it together.
+    """Reads the particles of each frame, from measured tracks or from a ground truth. The constructor is collective.
 
     Attributes
     ----------
-    times : times of the frames. spacing : mean distance of the particles.
-    scales : the flow's scales, and the `filter_width` and `spacing` of particles that would resolve the modes in one
-    frame. slab : this rank's part of the box, with the planes of the grid of the modes.
-    most : largest number of particles in a frame. truth : the ground truth with true fields; None for measured tracks.
-    unit, corner : the scene's unit of length and the place of the tracks' origin in the cube, both in the tracks' unit.
+    times : times of the frames.
+    spacing : mean distance of the particles.
+    scales : scales of the flow, with `filter_width`. `spacing` is that of so many particles that one frame of them
+        would resolve the modes (`Reconstruction.resolving`).
+    slab : this rank's part of the box, with the planes of the grid of the modes.
+    most : largest number of particles in a frame.
+    truth : the ground truth with true fields; None for measured tracks.
+    unit : the scene's unit of length, in the unit of the tracks.
+    corner : position in the cube of the origin of the tracks' coordinates, in the unit of the tracks.
     """
 
     def __init__(self, tracks: Tracks | None, tracers: Tracers, settings: Reconstruction, file: File,

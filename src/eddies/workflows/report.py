@@ -200,9 +200,9 @@ def _make(report: Report, comm: Comm, alone: Comm, stop: StopRequest,
           draw: bool = True) -> tuple[dict[str, Page], dict[str, list[Row]]]:
     """Make the pages. Return the pages of this rank, and the `numbers` of all rollouts, by name of the variant.
 
-    All ranks measure each rollout together. The rank that makes the variant's page collects the results. The pages are
-    made in rounds. A variant without one of its rollouts has no numbers. Raises Stopped, after a variant's rollouts are
-    measured or after a round, when `stop` asks for it.
+    All ranks measure each rollout together, and the rank that makes the variant's page collects the results. Then each
+    rank makes its pages, in rounds (`_makers`). A variant has no numbers if one of its rollouts is missing. Raises
+    Stopped when `stop` asks for it, after the rollouts of a variant or after a round.
     """
     names = list(report.pages) + [name for name in report.runs if name not in report.pages]
     (makers, rounds), made, found, truths, scanned = _makers(names, comm.size), {}, {}, {}, {}
@@ -445,7 +445,7 @@ def _compare(scene: Scene | None, report: Report, page: Page, found: Mapping[str
 
 def _write_main(report: Report, page: Page, first: Sequence[Section], beside: Mapping[str, str], text: str) -> None:
     """Write the main page, which begins with the sections `first`, and log its numbers; one rank calls it. `beside` and
-    `text` as for `_write`."""
+    `text` are arguments of `_write`."""
     _draw(first)
     page.sections = [*first, *page.sections]
     page.seconds = {**read_stage_seconds(report.directory), **page.seconds}
@@ -464,8 +464,8 @@ def _write_main(report: Report, page: Page, first: Sequence[Section], beside: Ma
 
 def _write(report: Report, page: Page, directory: Path, beside: Mapping[str, str] | None = None,
            text: str = "") -> None:
-    """Write a page about a run directory, its numbers, and the texts `beside` by file name. `text` is the scene as TOML
-    for a page about all variants; without it, the page shows the scene of the last product."""
+    """Write the page of a run directory, a file with its numbers, and further files: `beside` holds their texts by file
+    name. `text` is the scene that the page shows, as TOML; if it is empty, the page shows that of the last product."""
     rows = [("stage", "ranks", "wall time (s)", "date", "eddies", "commit", "libraries")]
     for kind, origin in page.provenance.items():
         stage = MAKER_OF[kind].name

@@ -92,8 +92,7 @@ def slabs_for(comm: Comm, tracers: Tracers, resolved: Tracers, filter_width: flo
               kolmogorov_length: float) -> SlabDecomposition:
     """Slabs of a grid for the modes that the tracers `resolved` would resolve.
 
-    The spectrum of the flow may end at lower wavenumbers, which need fewer planes; the planes of `tracers` are the
-    fewest.
+    If the spectrum of the flow ends at lower wavenumbers, the grid has fewer planes, but at least those of `tracers`.
     """
     highest = resolved_wavenumber(resolved.spacing, filter_width, kolmogorov_length)
     planes = 2 * math.ceil(CELLS_PER_WAVENUMBER / 2 * highest)
@@ -101,7 +100,10 @@ def slabs_for(comm: Comm, tracers: Tracers, resolved: Tracers, filter_width: flo
 
 
 def solver_of(slab: SlabDecomposition, reference: Mapping[str, float], weight: float) -> ResolvedVelocity:
-    """The solver for a weight of the noise. `reference` holds scales under their names in a ground truth."""
+    """Make the least-squares solver with this weight of the noise.
+
+    `reference` holds the reference scales, with the names that they have in ground_truth.h5.
+    """
     scales = ReferenceScales(
         velocity=reference["velocity_rms"], acceleration=reference["acceleration_rms"],
         **{name: reference[name] for name in ("filter_width", "spacing", "density_mean", "viscosity",

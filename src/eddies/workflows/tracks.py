@@ -74,8 +74,8 @@ def with_tracks(scene: Scene, comm: Comm) -> Scene:
 
 def _unfit(settings: Tracks, learned: Sequence[str], wanted: Reconstruction | None, model: Model | None,
            simulation: Simulation | None, eulerian: Eulerian | None) -> Iterator[str]:
-    """Yield a message for each setting that cannot be used with tracks. `learned` are the sections of the scene that
-    need a model or a smoothing kernel."""
+    """Yield a message for each setting that cannot be used with tracks. `learned` are those of the sections [kernel],
+    [model] and [simulation] that the scene has."""
     if wanted is not None:
         if settings.viscosity is None and (wanted.method == "memory" or "acceleration" in wanted.fields):
             yield ("[tracks] viscosity: this key is missing, and the method memory and the acceleration need it; give "
@@ -140,7 +140,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                  "viscosity": viscosity, **measured_scales(comm, first, second, times[1])}
     width = tracers.filter_width if filtered else NO_FILTER * spacing
     found = {"kolmogorov_length": 0.0} | reference
-    # The second time with Kolmogorov's length in the prior.
+    # The first pass has no Kolmogorov length. The second pass uses the one that the first pass found in its prior.
     for resolved in (own, settings.resolving(own, filtered))[:2 if viscosity > 0 else 1]:
         slab = slabs_for(comm, own, resolved, width, found["kolmogorov_length"])
         particles = particles_on(slab, tracks.frame(0))

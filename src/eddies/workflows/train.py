@@ -102,10 +102,10 @@ def take_weights(source: StoredWeights, definition: ModelDefinition, seen: float
                  truth: GroundTruth, product: Path) -> None:
     """Write model.h5 with the weights that [model] path names, without training; collective.
 
-    Terms work in units of the flow (Eq. 4), so only the scales and the radius of interaction are those of this flow.
-    Tables are copied from the source, except the a-priori tests, which are repeated on this flow. The tests on the flow
-    of the training are kept as `source_a_priori` if the source has them. The cost of training is copied too. `seen` is
-    the training window as a fraction of this ground truth.
+    Terms work in units of the flow (Eq. 4), so only the scales and the radius of interaction change to those of this
+    flow. The tables and the cost of training are copied from the source, but the a-priori tests are repeated on this
+    flow. If the source has tests on the flow on which it was trained, they are kept as `source_a_priori`. `seen` is the
+    training window as a fraction of this ground truth.
     """
     comm = truth.decomposition.comm
     model = trained_model(definition, source, truth.scales, comm).to(truth.device).forced(truth.forcing)

@@ -44,12 +44,15 @@ MODEL, ROLLOUT = STAGES["train"].file, STAGES["simulate"].file
 
 def rows_of(scene: Scene, runs: Mapping[str, Sequence[Path]], measured: Mapping[str, Sequence[Mapping[str, Any]]],
             alone: Comm) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the rows of the variants, or of a scene without variants, with the keys COLUMNS; a missing number is None.
-    Return also the names of variants whose kernel differs from that of the scene or, with sets of tracers, of the first
-    variant. Their numbers of THROUGH_KERNEL cannot be compared with those of the others, and are left out.
+    """Return a row for each variant, or one row for a scene without variants, and the names of variants with another
+    kernel. A row has the keys COLUMNS; a missing number is None.
 
-    runs: directories of each variant's rollouts. measured: `numbers` of all rollouts of a variant; missing if one of
-    them is missing. Times are in turnovers T, and `wall_seconds` and `core_seconds` are per turnover.
+    A kernel is compared with that of the scene or, if the scene has sets of tracers, with that of the first variant. If
+    it differs, the numbers THROUGH_KERNEL cannot be compared with those of other variants, and are left out.
+
+    runs: directories of each variant's rollouts. measured: `numbers` of all rollouts of a variant. A variant is absent
+    there if one of its rollouts is missing. Times are in turnovers T; `wall_seconds` and `core_seconds` are per
+    turnover.
     """
     kernel_of = partial(stage_fingerprint, stage="train-kernel")
     kernels = {name: kernel_of(variant) for name, variant in scene.variant.items()}
@@ -107,19 +110,23 @@ def combined(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def simulation_seconds(rows: Sequence[Mapping[str, Any]], repeating: Collection[str],
                        of_truth: float | None) -> float | None:
-    """Return the wall seconds per turnover of the direct simulation: those of the fastest variant in `repeating`, the
-    names of variants on the same grid, which are timed like the other variants. Without such a variant, return
-    `of_truth`, the time of the ground truth."""
+    """Return the wall seconds per turnover of the direct simulation.
+
+    `repeating` are the names of variants on the grid of the direct simulation, which are timed like the other variants.
+    The result is the time of the fastest of them. If there is none, it is `of_truth`, the time of the ground truth.
+    """
     repeated = [row["wall_seconds"] for row in rows if row["wall_seconds"] is not None and row["name"] in repeating]
     return min(repeated, default=of_truth)
 
 
 def add_break_even(rows: Sequence[dict[str, Any]], simulation: float | None) -> None:
-    """Add the numbers of BREAK_EVEN to the rows of trained methods.
+    """Add the numbers of turnovers BREAK_EVEN to the rows of trained methods.
 
-    A grid is a rival if its mean velocity error is at most that of the method, at T/2 or, if no rollout reaches T/2, at
-    the end. The time of a grid includes the search for its step. `simulation`: wall seconds per turnover of the direct
-    simulation, None if unknown.
+    Each method is compared with the direct simulation, and with the fastest grid whose mean velocity error is not
+    larger. The error is that at T/2 or, if no rollout reaches T/2, that at the end. The time of a method includes its
+    training, and the times of methods and grids include the search for the step.
+
+    simulation: wall seconds per turnover of the direct simulation; None if unknown.
     """
     known = [row for row in rows if row["status"] == "complete" and row["wall_seconds"] is not None]
     measure = "velocity_error_half" if any(row["velocity_error_half"] is not None for row in known) else (
@@ -160,8 +167,8 @@ def notes(seeds: Sequence[int], without_kernel: Sequence[str], tracers: Mapping[
           cells: Mapping[str, int]) -> list[str]:
     """Return the sentences that a reader needs to interpret the numbers.
 
-    seeds: of the realisations. without_kernel: the variants without the numbers of THROUGH_KERNEL. By name of each
-    variant, `tracers` are its tracers, and `cells` the cells of its coarse grid, 0 without one.
+    seeds: seeds of the realisations. without_kernel: names of the variants without the numbers THROUGH_KERNEL. tracers,
+    cells: by name of the variant, its tracers, and the cells along each side of its coarse grid, 0 without one.
     """
     found = [f"Mean and standard deviation over {len(seeds)} realisations, seeds {', '.join(map(str, seeds))}, that no "
              "training has seen." if len(seeds) > 1 else

@@ -51,8 +51,9 @@ class Step:
 
 
 def rollouts(scene: Scene, directory: Path) -> dict[str, dict[Path, Scene]]:
-    """The rollouts of each variant, one for each realisation: the scene of each by its directory, which is a complete
-    run directory. A scene without variants counts as one variant, unless it has sets of tracers."""
+    """The rollouts by name of the variant. Each variant has one rollout for each realisation, given as the directory
+    and the scene of the rollout. The directory is a complete run directory. A scene without variants counts as one
+    variant, unless it has sets of tracers."""
     found = {}
     for name in scene.variant or (None,):
         own, where = scene.variant[name] if name else scene.without_variants, directory / (name or "")
@@ -137,6 +138,6 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
 
 
 def _files(stages: Sequence[str], directory: Path, sets: Collection[str]) -> tuple[Path, ...]:
-    """The files of the products that stages make in a directory; `sets` are the names of the sets of tracers."""
+    """The product files that the stages make in a directory and, for "dns", in those of the sets of tracers `sets`."""
     of_sets = [directory / name / STAGES["dns"].file for name in sets if "dns" in stages]
     return *(directory / STAGES[stage].file for stage in stages), *of_sets

@@ -69,7 +69,7 @@ class PairTerm(Term, PairSum):
     """
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
-        """Contribution from the sums (components, k) over each particle's neighbours."""
+        """Contribution of the term to the rates of k particles, from the sums (components, k) over their neighbours."""
         raise TermError(f"{type(self).__name__}: has no rates_of(sums, context); define it, and let it return Rates")
 
     def forward(self, context: Context) -> Rates:

@@ -29,7 +29,7 @@ PRODUCT_BYTES, REPORT_BYTES, SAMPLE_BYTES = 45_000, 10e6, 200
 
 
 class Storage(NamedTuple):
-    """Memory of the rank that needs most in a stage, and disk space of the stage.
+    """Bytes that a stage needs: memory of the rank that needs the most, and disk space of the stage.
 
     `kept` is what the stage leaves in the run directory, None if unknown. `scratch` is what it removes at its end.
     `other_files` is the part of `kept` that is not in its product.
@@ -93,8 +93,8 @@ def kernel_memory(kernel: Kernel, tracers: Tracers, ranks: int) -> float:
 
 
 def evaluation_memory(tracers: Tracers, ranks: int, neighbors: float, skin: float, planes: int) -> float:
-    """Memory of a rank in an evaluation of the model. `neighbors` is 0 for a model without pairs. `planes` are those of
-    the grid of the resolved velocity, 0 without it."""
+    """Memory of a rank in an evaluation of the model. `neighbors` is 0 for a model without pairs. `planes` is the
+    number of planes of the grid of the resolved velocity, 0 for a model without this grid."""
     own = tracers.particles / ranks
     size = PARTICLE_BYTES * own + POINT_BYTES * planes**2 * math.ceil(planes / ranks)
     if neighbors:

@@ -84,7 +84,7 @@ class TrackFrames:
 
     @property
     def even_count(self) -> int:
-        """Number of particles with the tracks' spacing that fill the periodic cube."""
+        """Number of particles that would fill the periodic cube with the mean spacing of the tracks."""
         return round((BOX_LENGTH / self.spacing) ** 3)
 
     def frame(self, number: int, complete: bool = False) -> dict[str, np.ndarray]:
@@ -172,9 +172,11 @@ def _at_frames(found: Tracks, settings: Settings) -> Tracks:
 
 
 def _placed(found: Tracks, settings: Settings) -> tuple[Tracks, float, float, np.ndarray]:
-    """Return tracks in a periodic cube, its edge, the volume with particles, and the file's origin in the cube.
+    """Place the tracks in a periodic cube. Return the tracks with their new positions, the edge of the cube, the
+    measured volume, and the position in the cube of the origin of the file's coordinates.
 
-    A volume that is not periodic lies in the middle of a larger cube, at least `margin` away from its periodic images.
+    If the measured volume is not periodic, it lies in the middle of a larger cube, at least `margin` away from its
+    periodic images.
     """
     if settings.volume is None:
         edge = settings.box if settings.box is not None else found.edge

@@ -1,4 +1,7 @@
-"""What defines a model in a scene, and the comparison with a trained model of another run. Needs no torch."""
+"""The definition of a model in a scene, and its comparison with the trained model of another run.
+
+The module does not need torch.
+"""
 
 from __future__ import annotations
 
@@ -83,11 +86,11 @@ class ModelDefinition:
 
 
 def read_source(name: str, definition: ModelDefinition, comm: Comm) -> StoredWeights:
-    """Read the trained model that [model] path of the scene `name` names; all ranks call it.
+    """Read the trained model at [model] path; all ranks call it. `name` is the name of the scene, for errors.
 
     Raises:
         ProductError: the file is missing or damaged.
-        SceneError: the model has other terms, settings, neighbours or filter width in spacings than the scene.
+        SceneError: the model and the scene differ in terms, settings, neighbours, or filter width in spacings.
     """
     path = definition.model.weights_file
     try:
@@ -101,11 +104,12 @@ def read_source(name: str, definition: ModelDefinition, comm: Comm) -> StoredWei
 
 
 def trained_on(source: StoredWeights, path: str) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:
-    """The origin of the weights of a source, and the a-priori errors on the flow of the training.
+    """Return the origin of the weights, and the a-priori errors on the flow on which they were trained.
 
-    The origin has `path` and `mach_turbulent` of the run that trained the weights. A source that took its weights from
-    another run stores this origin. If the source was trained only on ground truths of other runs, the origin has
-    `truths`, their Mach numbers, instead of `mach_turbulent`, and the errors are None.
+    The origin holds `path` and `mach_turbulent` of the run that trained the weights. If `source` itself took its
+    weights from another run, the result is the origin that it stores; the errors are None if it stores none. If the
+    weights were trained only on ground truths of other runs, the origin holds the Mach numbers of these, `truths`,
+    instead of `mach_turbulent`, and the errors are None.
     """
     origin = source.provenance
     if "source" in origin:

@@ -38,7 +38,7 @@ Trainer = TypeVar("Trainer")
 
 
 def training_phases(data: Sequence[TrainingData], kernel_file: Path) -> list[Phase]:
-    """All phases of a training; none if the model has no parameters. Only the field loss averages with the kernel."""
+    """All phases of a training; none if the model has no parameters. The kernel is read only for the field loss."""
     if next(data[0].model.parameters(), None) is None:
         return []
     kernel, truth = None, data[0].truth

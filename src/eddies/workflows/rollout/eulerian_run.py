@@ -192,10 +192,12 @@ def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float,
 
 
 def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame: int) -> np.ndarray:
-    """The modes of the true flow at a frame, on the grid of a fluid, after a filter of the width `filter_passed`.
+    """Modes of the true flow at a frame, on the grid of `fluid`. The velocity is filtered with the width
+    `filter_passed`; 0 means no filter.
 
-    The density is read from the frame; a filtered velocity gets a density in balance with it. Raises SceneError if the
-    unfiltered flow is not stored at that frame.
+    A compressible fluid also has a density. It is read from the frame if there is no filter. If there is one, the
+    density is in balance with the filtered velocity. Raises SceneError if the unfiltered flow is not stored at the
+    frame.
     """
     grid, series = fluid.grid, truth.states
     if frame not in truth.state_frames:
@@ -225,11 +227,11 @@ def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame:
 
 @torch.no_grad()
 def state_of_particles(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame: int) -> np.ndarray:
-    """The modes that least squares find in the velocities of the true particles at a frame (`ResolvedVelocity`). The
-    filter of the particles is undone, unless the equations are for the filtered velocity. A compressible fluid gets a
-    density in balance with the velocity.
+    """Modes of the flow, found by least squares from the velocities of the true particles at a frame
+    (`ResolvedVelocity`). Modes that the particles do not resolve are zero.
 
-    Modes beyond those that the particles resolve are zero.
+    If `filter_passed` is 0, the filter of the particles' velocity is undone. A compressible fluid gets a density in
+    balance with the velocity.
     """
     solver, grid = ResolvedVelocity.on_slabs(truth.decomposition, truth.scales), fluid.grid
     resolved = solver.of(ParticleSet.from_numpy(truth.particles(frame)))

@@ -26,12 +26,11 @@ from eddies.workflows.rollout.particle_run import ParticleRun
 
 
 class Method(Protocol):
-    """Moves the particles of a rollout. All methods are collective.
+    """Moves the particles of a rollout. All functions are collective.
 
-    Class(scene, truth, start, directory, device) makes an instance of a user's class, where `start` is the frame of the
-    ground truth at which the rollout starts.
-
-    `state_dict` and `load_state_dict` may be missing: a stopped rollout then starts again from the beginning.
+    A user's class is called with (scene, truth, start, directory, device), where `start` is the frame of the ground
+    truth at which the rollout starts. It may lack `state_dict` and `load_state_dict`. A rollout that was stopped then
+    starts again from the beginning.
     """
 
     has_density: bool  # whether the particles of a frame have a density

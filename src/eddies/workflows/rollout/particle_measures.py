@@ -23,7 +23,7 @@ GRADIENT = "velocity_gradient"
 
 
 class ReconstructedFields:
-    """A series of fields: the velocity that a form reconstructs from particles on a grid, in the layout of a
+    """A series of velocity fields on a grid, reconstructed from particles by a `Form`. It can be read like a
     `FieldSeries`. Results for the last frame are kept.
 
     Parameters
@@ -39,7 +39,7 @@ class ReconstructedFields:
         self._kept: dict[str, tuple[int, Any]] = {}  # by name: frame of the last call, and its result
 
     def read(self, index: int, variable: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Read planes start, ..., stop - 1, (3, stop - start, y, x)."""
+        """The planes start, ..., stop - 1 of a frame: (3, stop - start, y, x)."""
         whole = self._once("velocity", index, lambda: self._by_component(self.form.on_grid(self._field(index)), 3))
         return whole[:, start:stop]
 

@@ -59,11 +59,11 @@ class Work:
 
 def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Collection[str] = (),
               overwrite: bool = True) -> Work:
-    """The work that stages of a scene find in a run directory; one rank calls it. `links` are further stages, whose
-    products are links to other directories.
+    """Find what a run directory already holds of the stages of a scene; one rank calls it. `links` are further stages,
+    whose products are links to other directories.
 
-    Raises WouldReplaceWork if work would be replaced and `overwrite` is false, and ProductError if the system refuses
-    to read a product or a checkpoint, because the file may be sound.
+    Raises WouldReplaceWork if work would be replaced and `overwrite` is false. Raises ProductError if the system
+    refuses to read a product or a checkpoint, because the file may be undamaged.
     """
     done, begun, obsolete, lost, changes = set(), set(), set(), [], {}
     seconds = stage_seconds(directory)
@@ -114,10 +114,11 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
 
 
 def link_products(products: Mapping[Path, str], directory: Path) -> None:
-    """Make a directory, and in it relative links to those products of other directories that exist. One rank calls it.
+    """Make a directory with relative links to products of other directories; one rank calls it.
 
-    `products` are the paths with the fingerprints of their settings. A product that the directory holds itself is kept
-    if it has this fingerprint, and else removed.
+    `products` maps the path of each product to the fingerprint of its settings. Products that do not exist get no link.
+    If the directory holds a file with the name of a product, the file is kept if it has this fingerprint, and otherwise
+    removed.
     """
     directory.mkdir(parents=True, exist_ok=True)
     for product, fingerprint in products.items():
