@@ -64,8 +64,9 @@ def load(path: str) -> Any:
 def users_code(called: Any, problem: type[UserError], hint: str = "") -> Iterator[None]:
     """Convert an exception of `called`, a user's class or function, into an error of type `problem`.
 
-    The text of the error names `called`, the file and the line, and ends with `hint`. A UserError or MemoryError passes
-    unchanged. So does any other exception if its type or `called` belongs to this package.
+    The text of the error names `called` and, if known, the file and the line; it ends with `hint`. A UserError or a
+    MemoryError passes unchanged. All exceptions pass unchanged if `called` belongs to this package. An exception whose
+    class belongs to this package also passes unchanged.
     """
     try:
         yield

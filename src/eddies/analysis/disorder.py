@@ -13,7 +13,9 @@ from eddies.analysis.rollout import Rollout
 # Bins of the PDF of nearest-neighbour distances, in mean spacings; for random points a share exp(-14) lies beyond.
 DISTANCE_EDGES = np.linspace(0, 1.5, 31)
 SAMPLED = 2**15  # largest number of particles whose nearest neighbour is searched
-PAIRS = 2**22  # about the largest number of pairs of a searched particle and another in its cell of a mean spacing
+# Limit of the work if particles cluster: the number of searched particles times the largest number of particles in a
+# cubic cell with the mean spacing as side.
+PAIRS = 2**22
 CELL = 2.0  # side of the cells in which particles are counted, in mean spacings: about a filter width
 
 

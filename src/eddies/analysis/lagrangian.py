@@ -71,8 +71,9 @@ def lags_of(longest: int) -> np.ndarray:
 
 
 def search_tree(position: np.ndarray, length: float) -> cKDTree:
-    """A tree that finds neighbours among positions (n, 3), periodic with `length`; its `data` are wrapped positions."""
-    from scipy.spatial import cKDTree  # takes a while to import, and `evenly` is used without it
+    """Build a tree that finds neighbours among positions (n, 3), periodic with `length`. Its `data` are the positions,
+    wrapped into the box."""
+    from scipy.spatial import cKDTree  # here, because the import is slow and other functions do not need it
     # A tree that is neither balanced nor compact is built several times faster.
     return cKDTree(wrap(position.astype(float), length), boxsize=length, balanced_tree=False, compact_nodes=False)
 
@@ -124,8 +125,10 @@ def differences(model: PathStatistics, truth: PathStatistics) -> dict[str, float
 
 
 def _sample(run: Frames, chosen: Sequence[int], column: str) -> np.ndarray:
-    """Vectors (m, n, 3) of a column in m `chosen` frames, of every k-th particle, with the smallest k that leaves at
-    most about VALUES numbers."""
+    """Read a vector column of every k-th particle in the m `chosen` frames: (m, n, 3).
+
+    k is the smallest integer for which the result has at most about VALUES numbers.
+    """
     every = -(-run.read(chosen[0], column).size * len(chosen) // VALUES)
     return np.stack([run.read(frame, column)[::every] for frame in chosen])
 

@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
-Method = Mapping[str, Any]  # keys: label; COST and errors (None: unknown); KEY_spread (standard deviation of KEY)
+# Keys of a method: label; COST and the keys of errors, with the value None if unknown; and KEY_spread, the standard
+# deviation of the error KEY over realisations.
+Method = Mapping[str, Any]
 COST = "wall_seconds"
 
 
@@ -84,6 +86,9 @@ def break_even(first: float, each: float, rival_first: float, rival_each: float)
 
 
 def _worse(row: Method, model: Method, key: str) -> bool:
-    """Whether the error of a row exceeds the model's by more than the larger of the two spreads."""
+    """Whether the error `key` of a method exceeds the model's error by more than the larger of their two spreads.
+
+    A spread is the standard deviation of an error over realisations, or 0 if it is unknown.
+    """
     spread = max(one.get(f"{key}_spread") or 0.0 for one in (row, model))
     return row[key] > model[key] + spread

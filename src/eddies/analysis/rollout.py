@@ -84,11 +84,11 @@ class SpectraAt:
         return np.arange(len(self.model))
 
     def error(self, of: str, filter_wavenumber: float) -> float:
-        """`spectrum_error` of "model" or "truth" against the filtered flow, up to k_d."""
+        """`spectrum_error` of the model or the truth (`of`) relative to the filtered flow, up to a wavenumber."""
         return spectrum_error(getattr(self, of), self.filtered, filter_wavenumber)
 
     def bands(self, of: str, filter_wavenumber: float) -> dict[str, float]:
-        """`band_ratios` of "model" or "truth" to the filtered flow, up to k_d."""
+        """`band_ratios` of the model or the truth (`of`) to the filtered flow, up to a wavenumber."""
         return band_ratios(getattr(self, of), self.filtered, filter_wavenumber)
 
 

@@ -8,15 +8,18 @@ from eddies.analysis.errors import rms_log_ratio
 def spectrum_error(energy: np.ndarray, reference: np.ndarray, largest_wavenumber: float) -> float:
     """Root mean square of ln(E(k) / E_reference(k)) over the shells 1 <= k <= largest_wavenumber, at least over k = 1.
 
-    `energy` and `reference` are (shells,), from k = 0 on. Shells beyond the last one count as absent. Not finite if one
-    of them has an empty shell.
+    `energy` and `reference` are (shells,), from k = 0 on. If the last shell has k < largest_wavenumber, the mean ends
+    there. The result is not finite if one of these shells is empty in `energy` or in `reference`.
     """
     shells = slice(1, _last_shell(largest_wavenumber, energy) + 1)
     return rms_log_ratio(energy[shells], reference[shells])
 
 
 def band_ratios(energy: np.ndarray, reference: np.ndarray, largest_wavenumber: float) -> dict[str, float]:
-    """Ratio of `energy` to `reference` in the bands of shells "1-2", "3-4", "5-8", ... as for `spectrum_error`."""
+    """Ratio of `energy` to `reference` in each of the bands of shells "1-2", "3-4", "5-8", ...
+
+    All shells together are those of `spectrum_error`.
+    """
     last, ratios, first, end = _last_shell(largest_wavenumber, energy), {}, 1, 2
     while first <= last:
         end = min(end, last)

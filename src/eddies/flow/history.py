@@ -60,7 +60,7 @@ class FlowHistory:
         return row
 
     def leave_out(self, seconds: float) -> None:
-        """Exclude these seconds of wall time since the last sample from the seconds per step."""
+        """Exclude `seconds` of wall time from the `seconds_per_step` of the next sample."""
         self._wall += seconds
 
     @property

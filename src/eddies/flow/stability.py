@@ -134,7 +134,7 @@ class StabilityWatch:
 
     def __init__(self, fluid: Fluid, stepper: Callable, history: Any) -> None:
         self.fluid, self.stepper, self.history = fluid, stepper, history
-        self._ceiling: float | None = None  # before the first step
+        self._ceiling: float | None = None  # the available energy; None before the first step
 
     def __call__(self, before: np.ndarray, after: np.ndarray, step: float, clock: Clock) -> None:
         """Raise FlowDiverged if the step from the state `before` to the state `after` was unstable.

@@ -7,7 +7,10 @@ from eddies.spectral.spectral_grid import SpectralGrid
 
 
 def energy_spectrum(grid: SpectralGrid, velocity: np.ndarray) -> np.ndarray:
-    """Return E(k) for k = 0, 1, ..., the energy of the modes whose |k| rounds to k; sum E = <u.u>/2."""
+    """Return the spectrum E(k), k = 0, 1, ...: E(k) is the energy of the modes whose |k| rounds to k.
+
+    |k| is in units of 2 pi / length. The sum of E is <u.u>/2. Collective.
+    """
     shells = int(np.ceil(np.sqrt(3) * grid.cutoff)) + 1
     density = 0.5 * grid.multiplicity * (np.abs(velocity) ** 2).sum(axis=0)
     spectrum = np.bincount(grid.shell_number.ravel(), density.ravel().astype(float), minlength=shells)

@@ -169,10 +169,11 @@ def write_block(dataset: h5py.Dataset, block: np.ndarray, offset: tuple[int, ...
 
 
 def read_frame(dataset: h5py.Dataset, frame: int, selection: tuple[slice, ...], limit: float = np.inf) -> np.ndarray:
-    """A part of a frame of floating-point numbers.
+    """Read the part `selection` of one frame; the dataset holds floating-point numbers.
 
-    ProductError, on this rank, if a number is not finite or, with a finite `limit`, is outside the range 0 to `limit`.
-    In a rollout, numbers that are not finite are no error, because a rollout may end with them.
+    Raises ProductError, on this rank only, if a number is not finite. If `limit` is finite, a number outside the range
+    0 to `limit` is an error, too. In a rollout, numbers that are not finite are allowed, because a rollout may end
+    with them.
     """
     values, kind = dataset[frame, *selection], dataset.file.attrs["kind"]
     place = f"frame {frame % len(dataset)}: holds values that are"

@@ -21,11 +21,12 @@ class _Modes(ctypes.Structure):
 
 
 class Formulas:
-    """Formulas for fields (c, ...) at grid points and for modes (c, kz, ky, kx) with the given wavevectors.
+    """Formulas for fields (c, ...) at grid points and for modes (c, kz, ky, kx).
 
-    A term of a sum is a pair (factors, state). Factors have the shape (kz, ky, n, kx) and are stored for kz >= 0 only,
-    because they are equal for kz and -kz. Arrays must have the precision of the wavevectors. Modes must be
-    contiguous, and so must each field; ValueError otherwise.
+    `wavevector` holds the components kx, ky and kz of the modes. The methods `sum_of_...` add terms, which are pairs
+    (factors, state). A state holds modes. Its factors (kz, ky, n, kx) are n real numbers per mode. They are stored for
+    kz >= 0 only, because they are equal for kz and -kz. Arrays must have the precision of the wavevectors. Modes must
+    be contiguous, and each field must be contiguous; ValueError otherwise.
     """
 
     def __init__(self, wavevector: Sequence[np.ndarray]) -> None:

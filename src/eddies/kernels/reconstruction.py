@@ -36,10 +36,11 @@ def kernel_numbers(support: float, pieces: np.ndarray, signed: bool = False) -> 
 
 def sums_on_grid(box: Box, cells: int, planes: range, numbers: tuple[float, ...], position: np.ndarray,
                  columns: np.ndarray) -> np.ndarray:
-    """Sums over particles x_j (n, 3) of c_j W(x - x_j), for columns c (n, 4), at points x of a grid: (points, 4).
+    """Sums over the particles, sum_j c_j W(x - x_j), at the points x of a grid: (points, 4).
 
-    The points are those of consecutive `planes` of a grid of `cells`^3 points. `numbers` are W as `kernel_numbers`
-    returns it. The result has the precision of the columns.
+    `position` (n, 3) holds the x_j, and `columns` (n, 4) holds the c_j. The points are those in the consecutive
+    `planes` of a grid of `cells`^3 points. `numbers` is the kernel W in the form that `kernel_numbers` returns. The
+    result has the precision of the columns.
     """
     position, columns = np.ascontiguousarray(position, np.float64), np.ascontiguousarray(columns)
     if columns.shape != (len(position), 4):
@@ -55,9 +56,9 @@ def fitted(box: Box, degree: int, numbers: tuple[float, ...], volume: float, rid
            senders: np.ndarray, receivers: np.ndarray, positions: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Moving least squares fit of a vector at each receiver, (n, 4, 3): the vector, then its x, y and z derivatives.
 
-    `eddies.particles.particle_field.ParticleField.fitted` defines the fit. `numbers` are the weight W as
-    `kernel_numbers` returns it, `volume` is the mean volume of a particle. `offsets` (n + 1,) and `senders` (m,) list
-    the particles near each receiver; some may lie outside the support. `positions` and `values` are (s, 3), `receivers`
+    `eddies.particles.particle_field.ParticleField.fitted` defines the fit. `numbers` is the weight W in the form that
+    `kernel_numbers` returns. `volume` is the mean volume of a particle. `offsets` (n + 1,) and `senders` (m,) list the
+    particles near each receiver; some may lie outside the support. `positions` and `values` are (s, 3), `receivers`
     (n, 3).
     """
     kernel = np.array(numbers)

@@ -28,10 +28,10 @@ class _Cloud(ctypes.Structure):
 class Splines:
     """The (degree + 1)^3 tensor-product B-splines around each of n points, for interpolation of degree 3 or 5.
 
-    `planes` are the indices of the consecutive planes that a rank holds of a periodic grid of `cells`^3 points: its own
-    and ghost planes. The methods take them as `parts`, three arrays (components, planes, y, x): ghosts below, own
-    planes, ghosts above. `positions` (n, 3) are periodic in x, y and z, but the splines must lie within the planes. The
-    points are sorted once, in the constructor. Raises MisplacedPoint.
+    The grid is periodic and has `cells`^3 points. A rank holds consecutive planes of it, its own and ghost planes;
+    `planes` are their indices. The methods take the values in these planes as `parts`, three arrays (components,
+    planes, y, x): ghosts below, own planes, ghosts above. `positions` (n, 3) are periodic in x, y and z, but the
+    splines must lie within the planes. The constructor sorts the points once. It raises MisplacedPoint.
     """
 
     def __init__(self, degree: int, positions: np.ndarray, cells: int, spacing: float, planes: range) -> None:
@@ -64,7 +64,10 @@ class Splines:
         self._call("splines_spread", parts, np.ascontiguousarray(values, np.float64))
 
     def _call(self, name: str, parts: Sequence[np.ndarray], *columns: np.ndarray) -> None:
-        """Call a library function with the address of each plane of each component and with `columns` of the points."""
+        """Call a library function on planes and on `columns`, arrays with one row for each point.
+
+        The function gets the address of each plane of each component, and the address of each column.
+        """
         kind = parts[0].dtype
         if any(part.dtype != kind or not part[0, 0].flags.c_contiguous for part in parts):
             raise ValueError(f"planes of {[part.dtype for part in parts]}: contiguous planes of one type are needed")

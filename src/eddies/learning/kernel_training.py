@@ -53,9 +53,11 @@ class KernelTrainer:
 
     Parameters
     ----------
-    network, samples : the kernel, and the fields that it is fitted to.
-    gradient_weight, normalization_weight : weights of Eq. 8; the velocity loss has weight 1.
-    points : number of grid points in a step.
+    network : the kernel.
+    samples : the fields to which it is fitted.
+    gradient_weight, normalization_weight : weights of these losses in Eq. 8; the velocity loss has weight 1.
+    points : number of random grid points per step, at most all points of the grid.
+    seed : seed of the random choice of samples and points.
     """
 
     def __init__(self, network: KernelNetwork, samples: list[KernelSample], gradient_weight: float,

@@ -156,7 +156,10 @@ class RolloutTrainer:
 
     def _errors(self, window: TrainingWindow, frame: int,
                 particles: ParticleSet) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield the error and the true change of the velocity, then of the density if the model learns its rate."""
+        """Yield the error of the velocity and its true change since the start of the window.
+
+        If the model learns the rate of the density, yield the same for the density.
+        """
         true = window.velocity[frame]
         yield particles.velocity - true, true - window.particles.velocity
         if self.integrator.dynamics.model.learns_density:

@@ -91,9 +91,10 @@ class ParticleDynamics:
     def settle(self, particles: ParticleSet, *others: ParticleSet) -> list[ParticleSet]:
         """Move particles to the ranks of their slabs if halo and list are outdated; collective.
 
-        With a resolved velocity but no list, they move once a particle is outside its slab. Integrators call `settle`
-        before they evaluate the rates. `others` are further states of the same particles, whose rows move too. Returns
-        all states. Nothing changes rank while a gradient is recorded: that would cut it.
+        With a resolved velocity but no list, particles move if at least one is outside its slab. Integrators call
+        `settle` before they evaluate the rates. `others` are further states of the same particles; their rows move with
+        the particles. Returns all states. While a gradient is recorded, no particle changes rank, because the move is
+        not differentiable.
         """
         states = [particles, *others]
         if self.fixed_ranks:

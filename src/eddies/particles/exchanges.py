@@ -69,7 +69,7 @@ def mean_over_ranks(comm: Comm, rows: Tensor) -> Tensor:
 
 
 def root_mean_square(comm: Comm, values: Tensor) -> float:
-    """Root mean square of all entries of all ranks, of vectors that of one component; collective."""
+    """Root mean square of all entries on all ranks; collective. For vectors it is the rms of one component."""
     square, count = global_sum(comm, np.array([float(values.double().square().sum()), values.numel()]))
     return float(np.sqrt(square / count))
 

@@ -45,8 +45,8 @@ class Form:
         return self.kernel.support
 
     def at(self, field: ParticleField, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Velocity (k, 3) and gradient (k, 3, 3) [component, direction] of the particles of a field at points (k, 3) of
-        this rank; collective."""
+        """Reconstruct the velocity (k, 3) and its gradient (k, 3, 3) [component, direction] at points (k, 3) of this
+        rank, from the particles of `field`; collective."""
         if self.name == "average":
             return field.averaged(self.kernel, points)
         if self.name == "kriging":
@@ -54,7 +54,8 @@ class Form:
         return field.fitted(self.kernel, DEGREES[self.name], self.mean_volume, points)
 
     def on_grid(self, field: ParticleField) -> Tensor:
-        """Velocity (m, 3) of the particles of a field at this rank's grid points, z slowest; collective."""
+        """Reconstruct the velocity (m, 3) at this rank's grid points, z slowest, from the particles of `field`;
+        collective."""
         if self.name == "average":
             return field.averaged_on_grid(self.kernel)
         return self.at(field, field.points)[0]

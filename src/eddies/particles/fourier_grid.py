@@ -53,7 +53,11 @@ class FourierGrid(ModeOperators):
         return _ToModes.apply(fields, self)
 
     def to_fields(self, modes: Tensor) -> Tensor:
-        """Fields of modes. Of the modes with kx = 0 only the part that belongs to a real field contributes."""
+        """Fields (c, z_local, y, x) of modes (c, kz, ky, kx).
+
+        The modes of a real field satisfy f(-k) = conj(f(k)). Only the part of the modes with kx = 0 that satisfies this
+        relation contributes.
+        """
         return _ToFields.apply(modes, self)
 
     def points(self, position: Tensor) -> Points:
@@ -83,9 +87,12 @@ class FourierGrid(ModeOperators):
         return self._transfers[width]
 
     def hidden_stress(self, stress: Tensor) -> Rates:
-        """Force and pressure p_tau (`pressure_of`) of a stress tau (6, kz, ky, kx) that the filter hides. The force is
+        """Force and pressure of a subgrid stress, from its modes tau (6, kz, ky, kx).
 
-            -grad p_tau - div tau = -P[div tau],   P the projection on solenoidal fields."""
+        `pressure_of` gives the pressure p_tau of the stress. The force is
+
+            -grad p_tau - div tau = -P[div tau],   P the projection on solenoidal fields.
+        """
         divergence = self.stress_divergence(stress)
         pressure = self.pressure_of(stress)
         return Rates(force_modes=-(divergence + self.gradient(pressure)), pressure_modes=pressure)

@@ -279,7 +279,10 @@ class LinearRates:
     parameters: Sequence[Tensor]
 
     def at(self, rows: Tensor | None) -> Rates:
-        """The rates of all particles or of some rows (k,); differentiable in the parameters."""
+        """The rates of the particles `rows` (k,), or of all particles; differentiable in the parameters.
+
+        The density is always given for all particles.
+        """
         values = {}
         for name in STORED:
             value, slope = getattr(self.origin, name), self.slopes.get(name)

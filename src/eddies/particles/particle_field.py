@@ -58,9 +58,10 @@ class ParticleField:
 
     @torch.no_grad()
     def volumes(self, kernel: SmoothingKernel) -> Tensor:
-        """Volumes (s,) of all local particles: 1 / sum_j W(x_i - x_j), including j = i, or the kernel's mean volume.
+        """Volumes (s,) of all local particles; collective.
 
-        The result is kept until another kernel is given. Collective.
+        The volume of particle i is 1 / sum_j W(x_i - x_j), including j = i. A kernel with a mean volume gives this
+        volume to all particles. The result is kept until another kernel is given.
         """
         if kernel.mean_volume is not None:
             return self._velocity.new_full((len(self._position),), kernel.mean_volume)
@@ -107,7 +108,7 @@ class ParticleField:
 
     @torch.no_grad()
     def averaged_on_grid(self, kernel: SmoothingKernel) -> Tensor:
-        """Average velocity (m, 3) at all of this rank's grid points; cheaper than with its gradient. Collective."""
+        """Average velocity (m, 3) at all of this rank's grid points; collective. It costs less than `averaged`."""
         slab, volume = self.decomposition, self.volumes(kernel)
         weighted = volume.unsqueeze(1) * torch.cat([torch.ones_like(volume).unsqueeze(1), self._velocity], dim=1)
         sums = torch.from_numpy(sums_on_grid(self._box, slab.planes, range(slab.start, slab.stop), _for_library(kernel),

@@ -53,7 +53,10 @@ def normalisation(kernel: SmoothingKernel, denominator: Tensor) -> Tensor:
 
 
 def _average(kernel: SmoothingKernel, pairs: Pairs, volume: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
-    """Average (components, count) and normalisation (1, count) from pair columns (m,) and (components, m)."""
+    """Average (components, count) and normalisation (1, count).
+
+    `volume` (m,) and `value` (components, m) are those of the sender of each pair.
+    """
     weight = volume * kernel.value(pairs.distance)
     sums = pairs.sum(torch.cat([weight.unsqueeze(0), weight * value]))
     factor = normalisation(kernel, sums[:1])

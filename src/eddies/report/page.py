@@ -125,9 +125,10 @@ def metrics_json(warnings: Sequence[str], sections: Sequence[Section]) -> str:
 
 
 def write_page(output: Path, run: RunRecord, sections: Sequence[Section], beside: Mapping[str, str]) -> None:
-    """Write index.html, metrics.json, figures/NAME.png and the texts `beside`, by file name. Remove older figures.
+    """Write index.html, metrics.json, figures/NAME.png and further texts; `beside` maps their file names to them.
 
-    Raises OSError or WriteError. If a file cannot be written, no existing file is changed.
+    If the directory has an earlier page, figures that the new page lacks are removed. Raises OSError or WriteError. If
+    a file cannot be written, no existing file is changed.
     """
     earlier = (output / "metrics.json").exists()  # only then are other figures removed
     (output / "figures").mkdir(parents=True, exist_ok=True)
@@ -141,7 +142,7 @@ def write_page(output: Path, run: RunRecord, sections: Sequence[Section], beside
 
 
 def render_page(run: RunRecord, sections: Sequence[Section]) -> str:
-    """Return the page as HTML, without the figures that are not drawn."""
+    """Return the page as HTML. Figures that are not drawn yet are left out."""
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"shown": shown, "embedded": _embedded}
     template = environment.from_string(Path(__file__).with_name("page.html").read_text(encoding="utf-8"))

@@ -207,8 +207,8 @@ def particle_disorder(distances: Mapping[str, np.ndarray], counts: Mapping[str, 
                       turnover: float) -> Figure:
     """Draw the PDF of nearest-neighbour distances, and the variance of particle counts over time.
 
-    distances: by "truth" and "model", probabilities (bins,) between the edges disorder.DISTANCE_EDGES. counts: by the
-    same names, times and variances of counts.
+    Both mappings have the keys "truth" and "model". distances: probabilities (bins,) between the edges
+    disorder.DISTANCE_EDGES. counts: times (frames,), and the variance of the counts at each time.
     """
     figure, axes = panels(1, 2, (4.0, 3.1))
     edges = disorder.DISTANCE_EDGES

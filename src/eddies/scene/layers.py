@@ -137,7 +137,11 @@ def read_document(name_or_path: str, above: Sequence[Path] = ()) -> tuple[Path, 
 
 
 def _find(name_or_path: str, beside: Path | None) -> Path:
-    """Return the file of a built-in scene or of a path, sought in `beside`, then in the working directory."""
+    """Return the file of the built-in scene with this name, or the file at this path.
+
+    A relative path is first taken relative to `beside`, if given, then to the working directory. Raises SceneError if
+    there is no such file.
+    """
     names = sorted(path.stem for path in BUILT_IN.glob("*.toml"))
     if name_or_path in names:
         return BUILT_IN / f"{name_or_path}.toml"

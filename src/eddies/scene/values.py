@@ -128,9 +128,9 @@ def text(about: str, default: Any = MISSING) -> Any:
 
 
 def texts(about: str, *words: str, default: Any = MISSING, paths: bool = False) -> Any:
-    """Declare a dataclass field that holds a tuple of strings: only `words` or, if none are given, any strings.
+    """Declare a dataclass field that holds a tuple of strings. If `words` are given, no other strings are allowed.
 
-    With `paths` import paths are allowed too.
+    If `paths` is true, import paths are allowed, too.
     """
     return _declare(Rule(str, about, words=words, paths=paths, many=True), default)
 

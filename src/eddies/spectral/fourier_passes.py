@@ -109,9 +109,9 @@ class PlanePass:
         return plans
 
     def to_modes(self, plans: PlanePlans, blocks: Blocks, component: int, planes: slice) -> None:
-        """Transform the planes in the memory of `plans`, and store twice their modes, not normalised, in `blocks`.
+        """Transform the planes in the memory of `plans`, and store their unnormalised modes, times 2, in `blocks`.
 
-        The first field becomes the component with the number `component`, and the others follow.
+        The first field is stored as component number `component`, and the others follow.
         """
         for number, of_field in enumerate(plans.plans, component):
             for plan in of_field:

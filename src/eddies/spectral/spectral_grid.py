@@ -184,7 +184,7 @@ class SpectralGrid(ModeOperators):
         return batch
 
     def _described(self, array: np.ndarray, dtype: type, shape: tuple[int, ...]) -> Described:
-        """Return the description of an array (c, *shape). Raises ValueError for another shape."""
+        """Return an array (c, *shape) as `Described`, after conversion to `dtype`. ValueError for another shape."""
         array = np.require(array, dtype, "CW")
         require(array, (len(array), *shape), dtype)
         return Described(array)

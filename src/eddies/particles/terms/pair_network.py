@@ -1,5 +1,7 @@
-"""Networks of pairs for the force and the density rate of Eqs. 3 and 4; and the weights, directions and scaling of all
-sums over pairs."""
+"""Neural networks for the pairwise force and density rate of Eqs. 3 and 4.
+
+The module also has the weights, directions and scaling that all sums over pairs use.
+"""
 
 from __future__ import annotations
 

@@ -28,8 +28,9 @@ Result = TypeVar("Result")
 
 class GroundTruth:
     """An open ground_truth.h5 that all ranks read. A particle is on the rank whose slab of `decomposition` holds it.
-    Frames for training and models go to `device`. The slabs have `planes` in all, by default those of the grid of the
-    resolved velocity.
+
+    `planes` is the number of planes of all slabs together. By default it is that of the grid of the resolved velocity.
+    The methods return arrays on the host. `device` is the device to which training and rollouts copy them.
 
     For an incompressible fluid no density is stored: `has_density` is false and columns of the density are missing.
     All ranks raise ProductError if one of them reads a value that is not finite.
