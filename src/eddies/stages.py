@@ -234,7 +234,7 @@ def prepare_directory(text: str, comm: Comm, directory: Path) -> None:
 def record_seconds(stage: str, seconds: float, comm: Comm, directory: Path, begun: bool) -> float:
     """Record the wall time of a stage in stage_seconds.json and return it.
 
-    If `begun` is true, the time that earlier runs recorded for the stage is added. A killed run records no time.
+    If `begun` is true, the time that earlier runs recorded for the stage is added. Killed and failed runs record none.
     """
     path = directory / SECONDS
 
