@@ -62,8 +62,8 @@ def commit() -> str | None:
 
 
 def product_ids(directory: Path, kinds: Iterable[str]) -> dict[str, str | None]:
-    """The ids of the products of these kinds in a directory, by kind. A missing or unreadable product is left out; a
-    product without an id gives None."""
+    """The ids of the products of these kinds in a directory, by kind. A missing or unreadable product is left out. The
+    value is None if a product has no id."""
     beside = {kind: product_provenance(directory / MAKER_OF[kind].file) for kind in kinds}
     return {kind: origin.get("id") for kind, origin in beside.items() if origin}
 

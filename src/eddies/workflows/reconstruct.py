@@ -81,8 +81,8 @@ class Source:
     ----------
     times : times of the frames.
     spacing : mean distance of the particles.
-    scales : scales of the flow, with `filter_width`. `spacing` is that of so many particles that one frame of them
-        would resolve the modes (`Reconstruction.resolving`).
+    scales : scales of the flow. `filter_width` is NO_FILTER times the spacing for unfiltered velocities. `spacing` is
+        that of so many particles that one frame of them would resolve the modes (`Reconstruction.resolving`).
     slab : this rank's part of the box, with the planes of the grid of the modes.
     most : largest number of particles in a frame.
     truth : the ground truth with true fields; None for measured tracks.

@@ -31,10 +31,11 @@ def evaluate(truth: GroundTruth, model: LagrangianModel, last_seen: int,
     `acceleration_sample` and, if learned, `density_rate_sample` hold true and predicted rates at the last frame.
     `a_priori` has a row for each frame, with the `delay` since frame `last_seen` and these normalised L2 errors:
 
-    `acceleration_error`: the model as in a rollout, with the density that its terms give.
-    `true_density_acceleration_error`: the model with the true density.
-    `density_rate_error`: the learned rate of the density, or the rate of change of the density that terms give.
-    `pressure_gradient_error`: no model, but -c^2 grad ln(rho) of the filtered field, plus the forcing if it stays on.
+    `acceleration_error`: acceleration by the model as in a rollout, with the density that its terms give.
+    `true_density_acceleration_error`: acceleration by the model with the true density.
+    `density_rate_error`: learned rate of the density, or rate of change of the density that terms give.
+    `pressure_gradient_error`: -c^2 grad ln(rho) of the filtered field as acceleration, without a model. If the flow is
+    forced after the release of the tracers, the forcing is added.
     """
     rows, comm = [], truth.decomposition.comm
     usable = np.array(between_frames(len(truth.times), truth.field_frames))
@@ -78,7 +79,7 @@ def _given_rate_error(truth: GroundTruth, dynamics: ParticleDynamics, index: int
 
 
 def _pressure_error(truth: GroundTruth, index: int, frame: TrainingFrame) -> float:
-    """Error of -c^2 grad ln(rho) of the filtered field, plus the forcing if it stays on, as the acceleration."""
+    """The normalised L2 error `pressure_gradient_error` of `evaluate` at a frame; collective."""
     acceleration, device = frame.acceleration, frame.acceleration.device
     forcing = frame.kept[FORCING].at(None).acceleration if FORCING in frame.kept else torch.zeros_like(acceleration)
     slab = SlabDecomposition(truth.decomposition.comm, truth.decomposition.length, truth.fields.cells)

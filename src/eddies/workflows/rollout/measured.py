@@ -103,7 +103,8 @@ class OnDemand(dict):
 class MeasuredRollout:
     """An open rollout on one rank, with its measures: spectra, invariants and planes at single frames.
 
-    Each measure is made once: when it is first used, or before that by all ranks with `measure`.
+    Each measure is computed once. All ranks can compute measures together with `measure`; the others are computed
+    by this rank when they are first used.
 
     Parameters
     ----------
@@ -167,7 +168,7 @@ class MeasuredRollout:
         own = on_all_ranks(comm, lambda: {(quantity, of, frame): getattr(self.rollout, quantity)[of][frame]
                                           for quantity, of, frame in new[comm.rank::comm.size]}, ProductError)
         for maker in (self._solver, *self._fields.values()):
-            maker.forget()  # many rollouts are open at a time
+            maker.forget()  # saves memory, because many rollouts are open at a time
         for task in new:
             if task[1] == "truth":
                 known[self._key(task)] = own.get(task)

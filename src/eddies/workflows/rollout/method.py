@@ -103,9 +103,9 @@ def make_method(scene: Scene, step: TimeStep | None, truth: GroundTruth, start: 
 def forcing_of(power: str | float, section: ForcingSection | None, truth: GroundTruth) -> Forcing | None:
     """The forcing of a rollout, or None if the rollout is not forced.
 
-    `power` is the key `injection` of [simulation]. "truth" gives the forcing of the ground truth, "none" gives no
-    forcing, and a number is the power per mass. "dissipation" gives the dissipation rate of the ground truth. The
-    forced wavenumbers are those of `section`, [forcing] of the scene; without such a section they are below 2.
+    `power` is the key `injection` of [simulation]: "truth" for the forcing of the ground truth, "none" for no forcing,
+    or a number, the power per mass. "dissipation" means the dissipation rate of the ground truth. Modes with
+    |k| < k_f are forced, where k_f is the `wavenumber` of `section`, [forcing] of the scene, or 2 without it.
     """
     if power == "truth":
         return truth.forcing
