@@ -162,7 +162,7 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
                 from eddies.workflows.train_kernel import keep_form  # imports torch
                 keep_form(comm, directory / stage.file, scene.kernel.form, stage_provenance(scene, name))
             continue
-        if "dns" in stage.depends_on and not checked:
+        if scene.tracers is not None and "dns" in stage.depends_on and not checked:
             later = step.stages[number:]
             check = partial(check_frames, later, scene.tracers, scene.own_training, scene.simulation,
                             scene.seen_in(directory))
@@ -180,21 +180,23 @@ def working_in(comm: Comm, directory: Path, stop: StopRequest, take_over: bool) 
 
 def run_stage(name: str, arguments: Sequence[Any], comm: Comm, directory: Path, stop: StopRequest,
               begun: bool) -> None:
-    """Run one stage with its arguments and record its wall time, also if it is stopped. If `begun` is true,
-    the time of earlier runs is added (`record_seconds`)."""
+    """Run one stage with its arguments and record its wall time, also if it is stopped. If `begun` is true, the stage
+    continues from a checkpoint, and the time of earlier runs is added."""
     log.info("%s: starts on %d %s", name, comm.size, "rank" if comm.size == 1 else "ranks")
     start = time.perf_counter()
     of_tracks = name == "dns" and arguments[0].tracks is not None
     # The report has run(directory, comm, variants, stop), the other stages have run(scene, comm, directory, stop).
     run = import_module(f"eddies.workflows.{'tracks' if of_tracks else name.replace('-', '_')}").run
     stop.check()
+    if not begun:
+        forget_seconds(name, comm, directory)
     try:
         run(*arguments)
         comm.Barrier()
     except Stopped:
-        record_seconds(name, time.perf_counter() - start, comm, directory, begun)
+        add_seconds(name, time.perf_counter() - start, comm, directory)
         raise
-    seconds = record_seconds(name, time.perf_counter() - start, comm, directory, begun)
+    seconds = add_seconds(name, time.perf_counter() - start, comm, directory)
     log.info("%s: took %s", name, duration(seconds))
 
 
@@ -231,17 +233,27 @@ def prepare_directory(text: str, comm: Comm, directory: Path) -> None:
     in_files(comm, directory, write)
 
 
-def record_seconds(stage: str, seconds: float, comm: Comm, directory: Path, begun: bool) -> float:
-    """Record the wall time of a stage in stage_seconds.json and return it.
-
-    If `begun` is true, the time that earlier runs recorded for the stage is added. Killed and failed runs record none.
-    """
+def add_seconds(stage: str, seconds: float, comm: Comm, directory: Path) -> float:
+    """Add to the wall time of a stage in stage_seconds.json and return the sum. Killed and failed runs add none."""
     path = directory / SECONDS
 
-    def record() -> float:
+    def add() -> float:
         recorded = stage_seconds(directory)
-        whole = seconds + (recorded.get(stage, 0.0) if begun else 0.0)
+        whole = recorded.get(stage, 0.0) + seconds
         write_files({path: json.dumps({**recorded, stage: round(whole, 3)}, indent=2) + "\n"})
         return whole
 
-    return in_files(comm, path, record)
+    return in_files(comm, path, add)
+
+
+def forget_seconds(stage: str, comm: Comm, directory: Path) -> None:
+    """Remove the wall time of a stage that starts from its beginning."""
+    path = directory / SECONDS
+
+    def forget() -> None:
+        recorded = stage_seconds(directory)
+        if stage in recorded:
+            del recorded[stage]
+            write_files({path: json.dumps(recorded, indent=2) + "\n"})
+
+    in_files(comm, path, forget)
