@@ -13,13 +13,14 @@ from eddies.measures import MEASURES
 
 
 def accuracy(run: Rollout) -> dict[str, float | None]:
-    """Return each measure of a rollout under its key in MEASURES, and under `end` the last common time / T.
+    """Return the measures of a rollout by their keys in MEASURES, and the end of the comparison by the key `end`.
 
-    T is the turnover time. A measure is None if its data are missing, for example because the rollout or the truth ends
-    too early. Velocity errors are normalised L2 errors over all particles; those at t_eta and T/2 are interpolated
-    linearly between frames. Measures at the end are taken at the last common frame, Lagrangian statistics over all
-    common frames. Both groups are None for a rollout that stops early or has a frame that is not finite, because it
-    ends earlier than the other rollouts.
+    The end is the last time that model and truth have in common, in units of the turnover time T. A measure is None if
+    its data are missing, for example because the rollout or the truth ends too early. Velocity errors are normalised L2
+    errors over all particles. Those at the Kolmogorov time t_eta and at T/2 are interpolated linearly between frames.
+    The acceleration error is that of the first common frame. The other measures are taken at the last common frame or,
+    if they are Lagrangian statistics, over all common frames. These are None for a rollout that stops early or has a
+    frame that is not finite, because such a rollout ends earlier than the others.
     """
     measures: dict[str, float | None] = dict.fromkeys(MEASURES)
     try:

@@ -1,4 +1,4 @@
-"""A rollout of the particle model compared with the true tracers: time series, PDFs, invariants."""
+"""Comparison of a rollout with the true tracers: time series, PDFs, and invariants of the velocity gradient."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,17 +10,20 @@ from eddies.analysis.pdfs import bin_edges, bin_probabilities, kl_divergence, sa
 from eddies.analysis.rollout import Frames, Pair, Rollout
 from eddies.analysis.velocity_gradients import ConditionalVelocity, InvariantBins, Invariants
 
-# Bins of the PDFs, in standard deviations of the truth.
+# Edges of the bins of the PDFs, in standard deviations of the truth.
 EDGES = {"velocity": bin_edges(5, 60), "acceleration": bin_edges(8, 80)}
 
 
 def mean_energy(frames: Frames, frame: int) -> float:
-    """<v.v>/2 of a frame."""
+    """Return the mean kinetic energy <v.v>/2 of the particles in a frame."""
     return 0.5 * float(np.mean(np.sum(frames.read(int(frame), "velocity") ** 2, axis=1)))
 
 
 def particle_series(frames: Frames, chosen: Sequence[int]) -> dict[str, np.ndarray]:
-    """Time series over chosen frames, by name: time, energy <v.v>/2, and density_rms if a density is stored."""
+    """Return time series over the `chosen` frame numbers, by name.
+
+    Names are `time`, `energy` for <v.v>/2 and, if a density is stored, `density_rms` for its standard deviation.
+    """
     columns = {"time": frames.times[np.asarray(chosen)],
                "energy": np.array([mean_energy(frames, frame) for frame in chosen])}
     if "density" in frames.columns:
@@ -29,10 +32,11 @@ def particle_series(frames: Frames, chosen: Sequence[int]) -> dict[str, np.ndarr
 
 
 def error_series(run: Rollout) -> dict[str, np.ndarray]:
-    """Time series over the common frames, by name: time, velocity_error, velocity_kl, acceleration_kl, no_force.
+    """Return time series over the common frames of model and truth, by name.
 
-    `velocity_error` is the normalised L2 error. `no_force` is this error for particles that keep the true velocity of
-    the first common frame. `velocity_kl` and `acceleration_kl` are values of `pdf_divergence`.
+    Names are `time`, `velocity_error`, `no_force`, `velocity_kl` and `acceleration_kl`. `velocity_error` is the
+    normalised L2 error of the velocities. `no_force` is this error for particles that keep the true velocity of the
+    first common frame. `velocity_kl` and `acceleration_kl` are values of `pdf_divergence`.
     """
     rows, first = [], run.pair(0, "velocity").truth
     for index in range(run.common.times.size):
@@ -45,16 +49,20 @@ def error_series(run: Rollout) -> dict[str, np.ndarray]:
 
 
 def pdf_divergence(pair: Pair, edges: np.ndarray) -> float:
-    """Forward KL divergence between the PDFs of truth and model, each over the values of all components. The values of
-    both are standardised with the mean and the standard deviation of the truth."""
+    """Return the forward KL divergence between the PDFs of truth and model.
+
+    Each PDF counts the values of all components. The values of both are standardised with the mean and the standard
+    deviation of the truth. `edges` are the edges of the bins for these standardised values.
+    """
     return kl_divergence(bin_probabilities(standardized(pair.truth), edges),
                          bin_probabilities(standardized(pair.model, pair.truth), edges))
 
 
 def sampling_floor(pair: Pair, edges: np.ndarray) -> float:
-    """Expected divergence between the PDFs of two independent samples of the truth.
+    """Return the expected `pdf_divergence` between two independent samples of the truth, each as large as the truth.
 
-    The divergence of a model can be below this floor while its particles are still near the true ones.
+    The divergence of a model can be below this floor while its particles are still near the true ones, because the
+    samples of model and truth are then not independent.
     """
     values = standardized(pair.truth)
     return sampling_divergence(len(values), lambda rows: bin_probabilities(values[rows], edges))
@@ -62,7 +70,11 @@ def sampling_floor(pair: Pair, edges: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class InvariantStatistics:
-    """Q-R statistics at one time: bin probabilities of model and truth, and the sampling floor of their divergence."""
+    """Joint statistics of the invariants Q and R of the velocity gradient at one time.
+
+    `model` and `truth` are the probabilities of the bins. `floor` is the expected divergence between two independent
+    samples of the truth.
+    """
 
     bins: InvariantBins
     model: np.ndarray
@@ -71,8 +83,11 @@ class InvariantStatistics:
 
     @classmethod
     def of(cls, model: Invariants, truth: Invariants) -> "InvariantStatistics":
-        """Joint PDFs of Q and R. Both runs are scaled with <Q_w> = <W_ij W_ij> / 2 of the truth. So a wrong amplitude
-        of the model changes its PDF."""
+        """Return the statistics of model and truth.
+
+        Both are in units of <Q_w> = <W_ij W_ij> / 2 of the truth, where W is the antisymmetric part of the velocity
+        gradient. So a wrong amplitude of the model changes its PDF.
+        """
         model_plane, truth_plane = (run.normalized(truth.scale) for run in (model, truth))
         bins = InvariantBins.covering(*truth_plane)
         floor = sampling_divergence(len(truth.second),
@@ -81,20 +96,20 @@ class InvariantStatistics:
 
     @property
     def divergence(self) -> float:
-        """Forward KL divergence of the joint PDFs."""
+        """Forward KL divergence between the joint PDFs of truth and model."""
         return kl_divergence(self.truth, self.model)
 
 
 def last_invariants(run: Rollout) -> InvariantStatistics:
-    """Q-R statistics at the last common frame of a rollout with a kernel."""
+    """Return the Q-R statistics at the last common frame of a rollout that has a kernel."""
     return InvariantStatistics.of(*run.both(run.invariants, -1))
 
 
 def conditional_flows(run: Rollout, bins: InvariantBins) -> tuple[ConditionalVelocity, ConditionalVelocity] | None:
-    """Conditional mean (dQ/dt, dR/dt) of model and truth over all common frames; None with fewer than two frames.
+    """Return the mean (dQ/dt, dR/dt) given (Q, R), first of the model and then of the truth, over all common frames.
 
-    Rates are finite differences between successive frames. The units of Q, R and the rates are powers of the truth's
-    <Q_w>, averaged over the two frames.
+    Return None if there are fewer than two common frames. Rates are finite differences between successive frames. The
+    units of Q, R and the rates are powers of <Q_w>, which is the mean of the truth's values in the two frames.
     """
     times = run.common.times
     if times.size < 2:

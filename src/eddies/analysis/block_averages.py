@@ -2,7 +2,7 @@
 
 Successive frames are not independent: the large eddies, which hold the energy, change in about a turnover. Means of
 blocks of at least a turnover are nearly independent, so that their scatter gives the error of the mean. The energy of
-forced flows varies over several turnovers, so for them even these errors are too small.
+a forced flow varies over several turnovers. Therefore these errors are still too small for a forced flow.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +21,8 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Blocks:
-    """Blocks of equal duration: `times` (n,) of all samples; `members` has the row numbers of each block's samples."""
+    """Blocks of equal duration. `times` (n,) are the times of all samples. `members` holds, for each block, the row
+    numbers of its samples."""
 
     times: np.ndarray
     members: Sequence[np.ndarray]
@@ -39,15 +40,19 @@ class Blocks:
         return cls(times, [rows for rows in members if rows.size])
 
     def means(self, samples: np.ndarray) -> np.ndarray:
-        """Mean of each block: (n, ...) -> (blocks, ...)."""
+        """Return the mean of the samples of each block: (n, ...) -> (blocks, ...)."""
         return np.array([samples[rows].mean(axis=0) for rows in self.members])
 
     def mean(self, samples: np.ndarray) -> Estimate:
-        """Mean of the block means of samples (n,); the error is their standard deviation divided by sqrt(blocks)."""
+        """Return the mean of the block means of samples (n,). Its error is the standard deviation of the block means
+        divided by sqrt(blocks)."""
         return self.of_mean(samples, float)
 
     def of_mean(self, samples: np.ndarray, function: Callable[[np.ndarray], float]) -> Estimate:
-        """A function of the mean of samples (n, ...), with the jackknife error over blocks (Miller 1974)."""
+        """Return the value of `function` at the mean of the block means of samples (n, ...).
+
+        The error is the jackknife error over blocks (Miller 1974).
+        """
         means = self.means(samples)
         count, value = len(means), function(means.mean(axis=0))
         if count < 2:
@@ -56,9 +61,9 @@ class Blocks:
         return Estimate(value, float(np.sqrt((count - 1) * np.var(without))))
 
     def trend(self, samples: np.ndarray) -> Estimate:
-        """Slope of the regression line of samples (n,) over time, with its error from the block means of the residuals.
+        """Return the slope of the regression line of samples (n,) over time.
 
-        The error is NaN for fewer than 3 blocks.
+        The error comes from the block means of the residuals. It is NaN for fewer than 3 blocks.
         """
         offsets, deviations = self.times - self.times.mean(), samples - samples.mean()
         slope = float(np.sum(offsets * deviations) / np.sum(offsets**2)) if offsets.any() else np.nan

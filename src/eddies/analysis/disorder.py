@@ -10,11 +10,12 @@ from eddies.analysis.lagrangian import evenly, search_tree
 from eddies.analysis.pdfs import bin_probabilities
 from eddies.analysis.rollout import Rollout
 
-# Bins of the PDF of nearest-neighbour distances, in mean spacings; for random points a share exp(-14) lies beyond.
+# Edges of the bins for distances to the nearest neighbour, in mean spacings. Of random points, only a share exp(-14)
+# has a larger distance.
 DISTANCE_EDGES = np.linspace(0, 1.5, 31)
 SAMPLED = 2**15  # largest number of particles whose nearest neighbour is searched
-# Limit of the work if particles cluster: the number of searched particles times the largest number of particles in a
-# cubic cell with the mean spacing as side.
+# Largest product of two numbers: the particles whose nearest neighbour is searched, and the particles in the fullest
+# cubic cell with the mean spacing as side. This limits the work if particles cluster.
 PAIRS = 2**22
 CELL = 2.0  # side of the cells in which particles are counted, in mean spacings: about a filter width
 
@@ -24,9 +25,10 @@ def mean_spacing(total: int, length: float) -> float:
 
 
 def nearest_distances(position: np.ndarray, length: float) -> np.ndarray:
-    """Distance to the nearest other particle for at most SAMPLED particles, evenly chosen by row: (n, 3) -> (m,).
+    """Return the distance to the nearest other particle for at most SAMPLED particles: (n, 3) -> (m,).
 
-    Distances are periodic with `length`. Infinite for a single particle.
+    These particles are evenly spread over the rows of `position`. The box is periodic with edge `length`. The distance
+    is infinite for a single particle.
     """
     crowd = _counts(position, length, round(len(position) ** (1 / 3))).max()
     tree, chosen = search_tree(position, length), evenly(len(position), min(SAMPLED, max(PAIRS // crowd, 1)))
@@ -34,23 +36,28 @@ def nearest_distances(position: np.ndarray, length: float) -> np.ndarray:
 
 
 def distance_probabilities(position: np.ndarray, length: float) -> np.ndarray:
-    """Share of nearest-neighbour distances in the bins DISTANCE_EDGES: (n, 3) -> (bins,); ValueError if n < 2."""
+    """Return the share of nearest-neighbour distances in each bin of DISTANCE_EDGES: (n, 3) -> (bins,).
+
+    Raises ValueError if n < 2.
+    """
     return bin_probabilities(nearest_distances(position, length) / mean_spacing(len(position), length),
                              DISTANCE_EDGES)
 
 
 def random_distance_density(distance: np.ndarray) -> np.ndarray:
-    """PDF of the nearest-neighbour distance r of random points, 4 pi r^2 exp(-4/3 pi r^3), r in mean spacings (Hertz
-    1909)."""
+    """Return the PDF 4 pi r^2 exp(-4/3 pi r^3) of the nearest-neighbour distance r of random points (Hertz 1909).
+
+    r is in mean spacings.
+    """
     return 4 * np.pi * distance**2 * np.exp(-4 / 3 * np.pi * distance**3)
 
 
 def count_variance(position: np.ndarray, length: float) -> float:
-    """Variance of the counts of particles (n, 3) in cells of side CELL mean spacings, divided by that of random points.
+    """Return the variance of the number of particles in a cell, divided by that of random points.
 
-    Counts of random points are multinomial: their variance is the mean times 1 - 1/cells. So the result is 0 for a
-    lattice, 1 to within sqrt(2 / cells) for random points, and above 1 for clusters. It is NaN for fewer than two
-    cells along a side.
+    Cells have a side of CELL mean spacings. `position` is (n, 3). Counts of random points are multinomial: their
+    variance is the mean times 1 - 1/cells. So the result is 0 for a lattice, 1 to within sqrt(2 / cells) for random
+    points, and above 1 for clusters. It is NaN if there are fewer than two cells along a side of the box.
     """
     side = round(len(position) ** (1 / 3) / CELL)
     if side < 2:
@@ -60,31 +67,32 @@ def count_variance(position: np.ndarray, length: float) -> float:
 
 
 def _counts(position: np.ndarray, length: float, side: int) -> np.ndarray:
-    """Number of particles in each of side^3 cells."""
+    """Return the number of particles in each of side^3 equal cells of the box."""
     cell = np.floor(position * (side / length)).astype(int) % side
     return np.bincount(np.ravel_multi_index(cell.T, (side,) * 3), minlength=side**3)
 
 
 def momentum_drift(start: np.ndarray, end: np.ndarray) -> float:
-    """|<v(end)> - <v(start)>| / u' of velocities (n, 3), u' the rms of a component about its mean at the start.
+    """Return |<v(end)> - <v(start)>| / u' from the velocities (n, 3) at two times.
 
-    Tracers of a flow that keeps its momentum have a drift of order n^(-1/2), because they sample the flow at n points.
+    u' is the rms of a velocity component about its mean at the start. Tracers of a flow that keeps its momentum have a
+    drift of order n^(-1/2), because they sample the flow at only n points.
     """
     start, end = (velocity.astype(float) for velocity in (start, end))
     return float(np.linalg.norm(end.mean(0) - start.mean(0)) / np.std(start - start.mean(0)))
 
 
 def mean_drift(start: np.ndarray, end: np.ndarray) -> float:
-    """<rho(end)> / <rho(start)> - 1 of densities (n,)."""
+    """Return <rho(end)> / <rho(start)> - 1 from the densities (n,) at two times."""
     before = np.mean(start, dtype=float)
     return float((np.mean(end, dtype=float) - before) / before)
 
 
 def drifts(run: Rollout) -> dict[str, dict[str, float]]:
-    """Drifts from the first to the last common time, and the count variance at the last time.
+    """Return drifts from the first to the last common time, and the variance of counts at the last common time.
 
-    Returns for each name the values of "model" and "truth". Names are `momentum_drift`, `count_variance` and, for a
-    model that integrates a density, `density_drift`.
+    Each name has the two values "model" and "truth". Names are `momentum_drift`, `count_variance` and, for a model that
+    integrates a density, `density_drift`.
     """
     columns = {"momentum_drift": ("velocity", momentum_drift)}
     if run.attributes.get("integrates_density", False):

@@ -4,7 +4,7 @@ import numpy as np
 
 
 def normalized_l2(prediction: np.ndarray, truth: np.ndarray) -> float:
-    """Normalised L2 error |prediction - truth| / |truth| over all entries of two arrays of one shape.
+    """Return the normalised L2 error |prediction - truth| / |truth| over all entries of two arrays of the same shape.
 
     Raises ValueError if the shapes differ or the truth is zero.
     """
@@ -18,10 +18,10 @@ def normalized_l2(prediction: np.ndarray, truth: np.ndarray) -> float:
 
 
 def rms_log_ratio(prediction: np.ndarray, truth: np.ndarray) -> float:
-    """Root mean square of ln(prediction / truth) over all entries.
+    """Return the root mean square of ln(prediction / truth) over all entries.
 
-    If every prediction is wrong by a factor e^a or e^-a, a > 0, the result is a. It is not finite if a ratio is not
-    positive, and NaN without entries.
+    If every prediction is wrong by a factor e^a or e^-a, a > 0, the result is a. The result is not finite if a ratio is
+    not positive, and NaN if there are no entries.
     """
     prediction, truth = np.asarray(prediction, dtype=float), np.asarray(truth, dtype=float)
     if prediction.size == 0:

@@ -12,7 +12,7 @@ import numpy as np
 from eddies.analysis.block_averages import Blocks, Estimate
 from eddies.measures import finite
 
-# Sreenivasan, Phys. Fluids 7, 2778 (1995); Yeung & Zhou, Phys. Rev. E 56, 1746 (1997).
+# Range of published values: Sreenivasan, Phys. Fluids 7, 2778 (1995); Yeung & Zhou, Phys. Rev. E 56, 1746 (1997).
 KOLMOGOROV_CONSTANT = (1.5, 1.64)
 INERTIAL = (0.03, 0.2)  # range of k eta in which spectra are compared with Kolmogorov's constant
 BOTTLENECK = 0.5  # largest k eta at which the maximum of a compensated spectrum is searched
@@ -20,38 +20,42 @@ COMPONENTS = ("energy_x", "energy_y", "energy_z")
 
 
 def gradient_skewness(reynolds_lambda: float) -> float:
-    """Skewness of the longitudinal gradient, -0.32 Re_lambda^0.11 (Ishihara et al., J. Fluid Mech. 592, 335, 2007).
+    """Return the skewness of the longitudinal velocity gradient, -0.32 Re_lambda^0.11.
 
-    A fit at Re_lambda > 200. Simulations at Re_lambda = 30 to 100 find -0.45 to -0.55.
+    This is a fit to simulations at Re_lambda > 200 (Ishihara et al., J. Fluid Mech. 592, 335, 2007). Simulations at
+    Re_lambda = 30 to 100 find -0.45 to -0.55.
     """
     return -0.32 * reynolds_lambda**0.11
 
 
 def gradient_flatness(reynolds_lambda: float) -> float:
-    """Flatness of the longitudinal gradient, 1.14 Re_lambda^0.34 (Ishihara et al. 2007, a fit at Re_lambda > 200)."""
+    """Return the flatness of the longitudinal velocity gradient, 1.14 Re_lambda^0.34.
+
+    This is a fit to simulations at Re_lambda > 200 (Ishihara et al. 2007).
+    """
     return 1.14 * reynolds_lambda**0.34
 
 
 def dissipation_constant(reynolds_lambda: float) -> float:
-    """C_eps = eps L / u'^3 = 0.2 (1 + sqrt(1 + (92 / Re_lambda)^2)), 0.4 at high Re_lambda.
+    """Return C_eps = eps L / u'^3 = 0.2 (1 + sqrt(1 + (92 / Re_lambda)^2)). It tends to 0.4 at high Re_lambda.
 
-    A fit to forced turbulence (Donzis, Sreenivasan & Yeung, J. Fluid Mech. 532, 199, 2005).
+    This is a fit to forced turbulence (Donzis, Sreenivasan & Yeung, J. Fluid Mech. 532, 199, 2005).
     """
     return float(0.2 * (1 + np.sqrt(1 + (92 / reynolds_lambda) ** 2)))
 
 
 def acceleration_constant(reynolds_lambda: float) -> float:
-    """a_0 = <a^2> nu^(1/2) / eps^(3/2) = 5 / (1 + 110 / Re_lambda) of an acceleration component in an unfiltered flow.
+    """Return a_0 = <a^2> nu^(1/2) / eps^(3/2) = 5 / (1 + 110 / Re_lambda) for a flow that is not filtered.
 
-    Sawford et al., Phys. Fluids 15, 3478 (2003).
+    a is an acceleration component, and nu the kinematic viscosity (Sawford et al., Phys. Fluids 15, 3478, 2003).
     """
     return 5 / (1 + 110 / reynolds_lambda)
 
 
 def modes_per_shell(largest: int) -> np.ndarray:
-    """Number of integer wavevectors whose length rounds to 0, 1, ..., largest: (largest + 1,)."""
+    """Return the number of integer wavevectors whose length rounds to 0, 1, ..., `largest`: (largest + 1,)."""
     k = np.arange(largest + 1)
-    twins = np.where(k == 0, 1, 2)  # k and -k
+    twins = np.where(k == 0, 1, 2)  # a component k > 0 also stands for -k
     squared, weights = np.add.outer(k**2, k**2), np.multiply.outer(twins, twins).ravel()
     modes = np.zeros(largest + 1)
     for kz, twin in zip(k, twins):
@@ -64,8 +68,9 @@ def modes_per_shell(largest: int) -> np.ndarray:
 class Row:
     """A quantity of this flow and its value in the literature.
 
-    `deviation` is the standard deviation of the quantity in time; None if the value is not an average. `error` is the
-    standard error of the value; None if the average is over fewer than two turnovers.
+    `deviation` is the standard deviation of the quantity in time. It is None if the value is not a time average.
+    `error` is the standard error of the value. It is None if it is unknown, for example because the average is over
+    fewer than two turnovers. `literature` is a number or a text, and `source` says where it comes from.
     """
 
     key: str
@@ -100,7 +105,7 @@ class StationarySpan:
         self.columns = {name: values[inside] for name, values in statistics.items()}
         self.viscosity, self.forced_below = viscosity, forced_below
         interval = np.diff(self.columns["time"])
-        # Trapezoidal rule: time steps vary, and so do the intervals between samples.
+        # Weights of the trapezoidal rule: time steps vary, and so do the intervals between samples.
         self._weights = (np.append(interval, 0) + np.append(0, interval)) / (2 * interval.sum())
         self.spectra = spectra[inside]
         self.spectrum = self._weights @ self.spectra
@@ -117,17 +122,17 @@ class StationarySpan:
         return self.average(self.columns[name])[0]
 
     def average(self, values: np.ndarray) -> tuple[float, float]:
-        """Time average and standard deviation of values (samples,)."""
+        """Return the time average of values (samples,), and their standard deviation in time."""
         mean = float(self._weights @ values)
         return mean, float(np.sqrt(self._weights @ (values - mean) ** 2))
 
     def block_mean(self, values: np.ndarray) -> Estimate:
-        """Time average of values (samples,) with its standard error from blocks of at least a turnover."""
+        """Return the time average of values (samples,). Its standard error comes from blocks of at least a turnover."""
         return Estimate(self.average(values)[0], self._blocks.mean(values).error)
 
     @property
     def energy_trend(self) -> Estimate:
-        """Relative trend of the energy: slope of the regression line of energy / mean energy, per turnover."""
+        """Relative change of the energy per turnover: the slope of the regression line of energy / mean energy."""
         return self._blocks.trend(self.columns["energy"] / self.mean("energy"))
 
     @cached_property
@@ -143,14 +148,14 @@ class StationarySpan:
 
     @property
     def kolmogorov_length(self) -> float:
-        """eta of the mean dissipation rate."""
+        """Kolmogorov's length eta from the mean dissipation rate."""
         return float((self.viscosity**3 / self.mean("dissipation_rate")) ** 0.25)
 
     def compensated_spectrum(self) -> tuple[np.ndarray, np.ndarray]:
-        """k eta and eps^(-2/3) k^(5/3) E(k) of the mean spectrum, for k = 1 to the last complete shell.
+        """Return k eta and eps^(-2/3) k^(5/3) E(k) of the mean spectrum, for k = 1 to the last complete shell.
 
-        The number of modes in a shell differs from 4 pi k^2: at k = 1 it is 18 instead of 12.6. So E(k) is here
-        4 pi k^2 times the mean energy per mode of the shell.
+        Here E(k) is 4 pi k^2 times the mean energy of a mode of the shell, because the number of modes in a shell
+        differs from 4 pi k^2: at k = 1 it is 18 instead of 12.6.
         """
         cutoff = int(np.rint(self.columns["kmax_eta"][-1] / self.columns["kolmogorov_length"][-1]))
         k = np.arange(1, cutoff + 1)
@@ -158,17 +163,17 @@ class StationarySpan:
         return k * self.kolmogorov_length, self.mean("dissipation_rate") ** (-2 / 3) * k ** (5 / 3) * energy
 
     def unforced(self) -> tuple[np.ndarray, np.ndarray]:
-        """`compensated_spectrum` in the shells without a forced mode."""
+        """Return `compensated_spectrum`, but only in the shells without a forced mode."""
         k_eta, compensated = self.compensated_spectrum()
         free = np.arange(1, len(k_eta) + 1) >= self.forced_below + 0.5
         return k_eta[free], compensated[free]
 
     def enstrophy_skewness(self) -> np.ndarray:
-        """Skewness S of the longitudinal gradient from the enstrophy budget of an isotropic flow, (samples,).
+        """Return the skewness S of the longitudinal gradient, (samples,), from the enstrophy budget of isotropic flow.
 
-        -S (35/2) (W/15)^(3/2) = nu <|grad w|^2> + 1/2 dW/dt with the enstrophy W = <w.w> = eps/nu and
-        <|grad w|^2> = 2 sum k^4 E(k) (Batchelor & Townsend, Proc. R. Soc. A 190, 534, 1947). The enstrophy that
-        the forcing injects is neglected: 1 % at Re_lambda = 85, 8 % at 25.
+        The budget is -S (35/2) (W/15)^(3/2) = nu <|grad w|^2> + 1/2 dW/dt. w is the vorticity, W = <w.w> = eps/nu the
+        enstrophy, and <|grad w|^2> = 2 sum k^4 E(k) (Batchelor & Townsend, Proc. R. Soc. A 190, 534, 1947). The
+        enstrophy that the forcing injects is neglected: 1 % at Re_lambda = 85, 8 % at 25.
         """
         enstrophy = self.columns["dissipation_rate"] / self.viscosity
         destroyed = 2 * self.viscosity * self.spectra @ np.arange(self.spectra.shape[1]) ** 4.0
@@ -176,13 +181,13 @@ class StationarySpan:
         return -(destroyed + growth) / (17.5 * (enstrophy / 15) ** 1.5)
 
     def component_shares(self) -> np.ndarray:
-        """Energy of each velocity component divided by the mean of the three, (3, samples)."""
+        """Return the energy of each velocity component divided by the mean energy of the three, (3, samples)."""
         energies = np.array([self.columns[name] for name in COMPONENTS])
         return energies / energies.mean(axis=0)
 
 
 def comparison(span: StationarySpan) -> list[Row]:
-    """Quantities of isotropic turbulence in this flow, and their values in the literature at its Re_lambda."""
+    """Return quantities of isotropic turbulence in this flow, with their values in the literature at its Re_lambda."""
     def averaged(key: str, label: str, values: np.ndarray, *literature) -> Row:
         error = finite(span.block_mean(values).error)
         return Row(key, label, *span.average(values), *literature, error=error)
@@ -217,7 +222,10 @@ def comparison(span: StationarySpan) -> list[Row]:
 
 
 def _spectrum_rows(span: StationarySpan) -> list[Row]:
-    """Rows for mean and maximum of the compensated spectrum; each needs an unforced shell in its range of k eta."""
+    """Return rows for the mean and the maximum of the compensated spectrum in the shells without forcing.
+
+    Each of them is measured in a range of k eta. It is left out if this range has no such shell.
+    """
     k_eta, compensated = span.unforced()
     inertial = compensated[(k_eta >= INERTIAL[0]) & (k_eta <= INERTIAL[1])]
     constant = "{}–{}, more in a bottleneck".format(*KOLMOGOROV_CONSTANT)
@@ -236,10 +244,10 @@ def _spectrum_rows(span: StationarySpan) -> list[Row]:
 
 
 def _compressibility_rows(span: StationarySpan) -> list[Row]:
-    """Rows of M_t and of quantities that scale with a power of M_t if M_t is small.
+    """Return rows for the turbulent Mach number M_t, and for quantities that scale with a power of a small M_t.
 
-    The density follows the pressure of the incompressible flow, rho' = p / c^2, so that rho_rms ~ M_t^2. The
-    compressible velocity is ~ M_t^2 u' (pseudo-sound: Ristorcelli, J. Fluid Mech. 347, 37, 1997).
+    The density follows the pressure of the incompressible flow, rho' = p / c^2. Therefore rho_rms is proportional to
+    M_t^2, and the compressible velocity to M_t^2 u' (pseudo-sound: Ristorcelli, J. Fluid Mech. 347, 37, 1997).
     """
     c, squared = span.columns, span.columns["mach_turbulent"] ** 2
     longitudinal = np.sqrt(c["compressible_fraction"])

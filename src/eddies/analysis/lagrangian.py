@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 VALUES = 2**22  # about the largest number of values of a column in memory at once, all frames together
 LAGS = 18       # largest number of lags
-TETRADS = 1000  # particles around which pairs and tetrads are followed
-CORNERS = 4
+TETRADS = 1000  # largest number of tetrads that are followed
+CORNERS = 4     # particles of a tetrad
 
 
 @dataclass(frozen=True)
@@ -30,12 +30,12 @@ class PathStatistics:
 
     Parameters
     ----------
-    times, lags : times of the frames, (m,), and lags in units of time, (l,).
+    times, lags : times of the frames since the first, (m,), and lags in units of time, (l,).
     structure, flatness : <dv^2> and <dv^4>/<dv^2>^2 of the increments dv of a velocity component over a lag, (l,).
     velocity_correlation : correlation of the velocities in each frame with those in the first frame, (m,).
     acceleration_correlation : correlation of the accelerations in two frames that are a lag apart, (l,).
     acceleration_variance : variance of an acceleration component, (m,).
-    pair_dispersion : <|r(t) - r(0)|^2> / <r(0)^2> of nearest neighbours, (m,).
+    pair_dispersion : <|r(t) - r(0)|^2> / <r(0)^2> of the separation r of nearest neighbours, (m,).
     tetrad_size : <R^2> divided by its value at the start, (m,). A tetrad is a particle and its three nearest
         neighbours, and R^2 is the sum of |x_i - x|^2 with the mean x of the four positions.
     tetrad_shape : mean eigenvalues of sum (x_i - x)(x_i - x)^T divided by R^2, the largest first, (m, 3); each is 1/3
@@ -55,33 +55,42 @@ class PathStatistics:
 
 
 def of_both(run: Rollout) -> tuple[PathStatistics, PathStatistics]:
-    """Statistics of model and truth over all common frames. Both use the tetrads of the truth in the first frame."""
+    """Return the statistics of model and truth over all common frames.
+
+    Tetrads are chosen from the true positions in the first common frame, and are the same particles in both.
+    """
     tetrads = near_tetrads(run.pair(0, "position").truth, run.length)
     return path_statistics(run.model, run.common.model, tetrads), path_statistics(run.truth, run.common.truth, tetrads)
 
 
 def evenly(total: int, most: int) -> np.ndarray:
-    """Row numbers, evenly spread from 0 to total - 1: all of them, or `most` if there are more."""
+    """Return row numbers from 0 to total - 1: all of them or, if there are more than `most`, `most` evenly spread."""
     return np.unique(np.linspace(0, total - 1, min(total, most)).astype(int))
 
 
 def lags_of(longest: int) -> np.ndarray:
-    """Lags, counted in frames: at most LAGS integers from 1 to `longest`, about evenly spread in the logarithm."""
+    """Return lags counted in frames: at most LAGS integers from 1 to `longest`, about evenly spread in the logarithm.
+
+    There are none if `longest` is 0.
+    """
     return np.unique(np.rint(np.geomspace(1, longest, LAGS)).astype(int)) if longest else np.empty(0, int)
 
 
 def search_tree(position: np.ndarray, length: float) -> cKDTree:
-    """Build a tree that finds neighbours among positions (n, 3), periodic with `length`. Its `data` are the positions,
-    wrapped into the box."""
+    """Return a tree that finds neighbours among positions (n, 3) in a periodic box of edge `length`.
+
+    The attribute `data` of the tree holds the positions, wrapped into the box.
+    """
     from scipy.spatial import cKDTree  # here, because the import is slow and other functions do not need it
     # A tree that is neither balanced nor compact is built several times faster.
     return cKDTree(wrap(position.astype(float), length), boxsize=length, balanced_tree=False, compact_nodes=False)
 
 
 def near_tetrads(position: np.ndarray, length: float) -> np.ndarray:
-    """Row numbers (4, m) in `position` (n, 3) of at most TETRADS particles, each with its 3 nearest neighbours.
+    """Return the row numbers (4, m) of the particles of m tetrads; m is at most TETRADS.
 
-    Raises ValueError for fewer than four particles.
+    A tetrad is a particle, which comes first, and its three nearest neighbours. `position` (n, 3) is in a periodic box
+    of edge `length`. Raises ValueError for fewer than four particles.
     """
     if len(position) < CORNERS:
         raise ValueError(f"{len(position)} particles: at least {CORNERS} are needed")
@@ -90,7 +99,8 @@ def near_tetrads(position: np.ndarray, length: float) -> np.ndarray:
 
 
 def path_statistics(run: Frames, chosen: Sequence[int], tetrads: np.ndarray) -> PathStatistics:
-    """Statistics of the chosen frames of a run; `tetrads` (4, g) holds row numbers of its particles."""
+    """Return statistics of a run in the `chosen` frames. `tetrads` (4, g) holds the row numbers of the particles of g
+    tetrads."""
     chosen = [int(frame) for frame in chosen]
     times = run.times[chosen] - run.times[chosen[0]]
     velocity, acceleration = (_sample(run, chosen, column) for column in ("velocity", "acceleration"))
@@ -104,10 +114,11 @@ def path_statistics(run: Frames, chosen: Sequence[int], tetrads: np.ndarray) -> 
 
 
 def differences(model: PathStatistics, truth: PathStatistics) -> dict[str, float]:
-    """Errors of the model by name: rms of ln(model / truth) over lags or times.
+    """Return errors of the model by name.
 
-    Dispersion and tetrads leave out the first time, when model and truth are equal. The error of the correlation of
-    accelerations, which changes sign, is the rms of the difference.
+    An error is the rms of ln(model / truth) over lags or times. Errors of the dispersion and of tetrads leave out the
+    first time, when model and truth are equal. The correlation of accelerations changes sign; therefore its error is
+    the rms of the difference.
     """
     def log_ratio(name: str, first: int = 0) -> float:
         return rms_log_ratio(getattr(model, name)[first:], getattr(truth, name)[first:])
@@ -135,7 +146,10 @@ def _sample(run: Frames, chosen: Sequence[int], column: str) -> np.ndarray:
 
 def _dispersion(run: Frames, chosen: Sequence[int],
                 tetrads: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pair dispersion (m,) of the first two corners of tetrads, tetrad size (m,) and shape (m, 3) in chosen frames."""
+    """Return pair dispersion (m,), tetrad size (m,) and tetrad shape (m, 3) in the m `chosen` frames.
+
+    The pairs are the first two particles of each tetrad. `tetrads` (4, g) holds row numbers.
+    """
     first = np.tile(tetrads[0], CORNERS - 1)
     paths = separations((run.read(frame, "position") for frame in chosen), tetrads[1:].ravel(), first, run.length)
     pairs, sizes, shapes, start = [], [], [], None
@@ -150,9 +164,10 @@ def _dispersion(run: Frames, chosen: Sequence[int],
 
 
 def tetrad_moments(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Size R^2 (g,) and shape (g, 3) of tetrads with the corners (4, g, 3).
+    """Return the size R^2 (g,) and the shape (g, 3) of g tetrads from the positions `corners` (4, g, 3).
 
-    The shape is the eigenvalues of the second moments divided by R^2, the largest first.
+    The shape consists of the eigenvalues of sum (x_i - x)(x_i - x)^T, divided by R^2, the largest first. x is the mean
+    of the four positions x_i.
     """
     offsets = corners - corners.mean(axis=0)
     eigenvalues = np.linalg.eigvalsh(np.einsum("cgi,cgj->gij", offsets, offsets))[:, ::-1]
@@ -161,25 +176,28 @@ def tetrad_moments(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def correlation(initial: np.ndarray, later: np.ndarray) -> float:
-    """<v(0).v(t)> / sqrt(<v(0)^2> <v(t)^2>) of the same particles (n, 3) at two times; NaN if v(0) or v(t) = 0."""
+    """Return <v(0).v(t)> / sqrt(<v(0)^2> <v(t)^2>) of vectors v (n, 3) of the same particles at two times.
+
+    The result is NaN if all v(0) or all v(t) are 0.
+    """
     with np.errstate(invalid="ignore"):
         return float(np.sum(initial * later) / np.sqrt(np.sum(initial**2) * np.sum(later**2)))
 
 
 def structure_function(velocity: Sequence[np.ndarray], lags: np.ndarray) -> np.ndarray:
-    """Second-order Lagrangian structure function <|v(t + lag) - v(t)|^2> / 3 of a component, (m,).
+    """Return the second-order Lagrangian structure function of a velocity component, <|v(t + lag) - v(t)|^2> / 3, (m,).
 
-    `velocity` is (frames, n, 3) at equal intervals; `lags` (m,) count frames. The mean is over particles and all start
-    frames.
+    `velocity` is (frames, n, 3) at equal intervals; `lags` (m,) count frames. The mean is over particles and over all
+    frames t.
     """
     return _over_lags(velocity, lags, lambda earlier, later: np.mean((later - earlier) ** 2))
 
 
 def increment_flatness(velocity: Sequence[np.ndarray], lags: np.ndarray) -> np.ndarray:
-    """Flatness <dv^4> / <dv^2>^2 of the increments of a velocity component over lags, (m,); 3 if Gaussian.
+    """Return the flatness <dv^4> / <dv^2>^2 of the increments dv of a velocity component over each lag, (m,).
 
-    Arguments as for `structure_function`. The flatness is averaged over start frames, so that the decay of a flow does
-    not widen the tails. NaN for a constant velocity.
+    It is 3 for Gaussian increments, and NaN for a constant velocity. Arguments are those of `structure_function`. The
+    flatness is averaged over start frames, so that the decay of a flow does not widen the tails.
     """
     def flatness(earlier: np.ndarray, later: np.ndarray) -> float:
         square = np.square(later - earlier, dtype=float)
@@ -191,22 +209,26 @@ def increment_flatness(velocity: Sequence[np.ndarray], lags: np.ndarray) -> np.n
 
 def _over_lags(values: Sequence[np.ndarray], lags: np.ndarray,
                function: Callable[[np.ndarray, np.ndarray], float]) -> np.ndarray:
-    """For each lag, apply `function` to the values of two frames that are a lag apart; average over start frames."""
+    """Return, for each lag, the mean of `function` over all pairs of frames that are a lag apart.
+
+    The arguments of `function` are the values in the earlier and in the later frame.
+    """
     return np.array([np.mean([function(earlier, later) for earlier, later in zip(values, values[lag:])])
                      for lag in lags])
 
 
 def minimum_image(displacement: np.ndarray, length: float) -> np.ndarray:
-    """Displacements to the nearest periodic image; arrays of any shape."""
+    """Return the displacements to the nearest periodic images; arrays have any shape."""
     return displacement - length * np.rint(displacement / length)
 
 
 def separations(position: Iterable[np.ndarray], first: np.ndarray, second: np.ndarray,
                 length: float) -> Iterator[np.ndarray]:
-    """Yield for each frame the separations x_first - x_second (m, 3) of pairs. `position` yields positions (n, 3).
+    """Yield for each frame the separations x_first - x_second (m, 3) of m pairs of particles.
 
-    Positions may be wrapped into the box. The first separation is to the nearest image. Later ones are continuous if no
-    component changes by more than length / 2 between frames. `first` and `second` (m,) hold row numbers of particles.
+    `position` yields the positions (n, 3) of each frame, which may be wrapped into the box. `first` and `second` (m,)
+    are row numbers of particles. The first separation is to the nearest image. Later ones are continuous if no
+    component of a separation changes by more than length / 2 between frames.
     """
     separation = 0.0
     for frame in position:
@@ -216,7 +238,7 @@ def separations(position: Iterable[np.ndarray], first: np.ndarray, second: np.nd
 
 
 def pair_dispersion(position: Iterable[np.ndarray], groups: Sequence[np.ndarray], length: float) -> np.ndarray:
-    """<|r(t) - r(0)|^2> of each group of pairs in each frame, (groups, frames).
+    """Return <|r(t) - r(0)|^2> of each group of pairs in each frame, (groups, frames); r is the separation of a pair.
 
     A group holds the row numbers (2, m) of its pairs. `position` yields the positions (n, 3) of each frame.
     """
@@ -231,9 +253,10 @@ def pair_dispersion(position: Iterable[np.ndarray], groups: Sequence[np.ndarray]
 
 def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], tolerance: float,
              followed: int) -> list[np.ndarray]:
-    """For each distance, row numbers (2, m) of the particle pairs at this distance within a relative `tolerance`.
+    """Return, for each distance, the row numbers (2, m) of the pairs of particles at this distance.
 
-    The first particle of a pair is in the first `followed` rows of `position` (n, 3). Each pair appears once.
+    The distance of a pair may differ from it by the relative `tolerance`. The first particle of a pair is in the first
+    `followed` rows of `position` (n, 3). Each pair appears once.
     """
     centres, tree = search_tree(position[:followed], length), search_tree(position, length)
     reach = (1 + tolerance) * max(distances, default=0.0)

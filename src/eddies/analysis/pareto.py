@@ -6,16 +6,17 @@ from typing import Any
 
 import numpy as np
 
-# Keys of a method: label; COST and the keys of errors, with the value None if unknown; and KEY_spread, the standard
-# deviation of the error KEY over realisations.
+# A method has the keys `label`, COST, and one for each error. An unknown cost or error is None. The key KEY_spread, if
+# present, holds the standard deviation of the error KEY over realisations.
 Method = Mapping[str, Any]
 COST = "wall_seconds"
 
 
 def pareto_front(cost: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Indices of the points (n,) that no other one dominates, in order of cost; points with NaN are left out.
+    """Return the indices of the points that no other point dominates, in order of cost.
 
-    A point dominates another if neither its cost nor its error is larger and one of them is smaller.
+    `cost` and `error` are (n,). Points with NaN are left out. A point dominates another if neither its cost nor its
+    error is larger and one of them is smaller.
     """
     cost, error = np.asarray(cost, float), np.asarray(error, float)
     measured = np.flatnonzero(np.isfinite(cost) & np.isfinite(error))
@@ -29,13 +30,13 @@ def pareto_front(cost: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 
 def verdict(model: Method, others: Sequence[Method], measures: Mapping[str, str]) -> list[str]:
-    """Two texts: the measures in which the model is worth its cost, and its rivals in the other measures.
+    """Return two texts: the measures in which the model is worth its cost, and its rivals in the other measures.
 
     The model is worth its cost in a measure if it has no rival. A rival is another method that costs no more and is at
     least as accurate. Errors count as equal if they differ by at most the larger of their spreads over realisations.
-    A method that lacks the cost or the error is no rival. For each measure, the text names the cheapest rival and the
-    number of further ones. Without other methods, there is one text that says so. `measures` maps keys of errors to
-    their names in words.
+    A method that lacks the cost or the error is no rival. The second text names the cheapest rival in each measure and
+    the number of further ones, and the measures that the model lacks. Without other methods, there is one text that
+    says so. `measures` maps keys of errors to their names in words.
     """
     if not others:
         return ["No other method was run."]
@@ -59,10 +60,10 @@ def verdict(model: Method, others: Sequence[Method], measures: Mapping[str, str]
 
 
 def cheapest_grid(model: Method, grids: Sequence[Method], times: Mapping[str, str]) -> str:
-    """A sentence that names the cheapest grid whose velocity error is at most the model's at all `times`.
+    """Return a sentence that names the cheapest grid whose velocity error is at most the model's at all `times`.
 
-    `times` maps keys of errors to the times in words. Means over realisations are compared. The sentence is empty
-    without `times`, or if the model's cost or one of its errors is None.
+    `times` maps keys of errors to the times in words. Errors are compared without their spreads over realisations. The
+    sentence is empty without `times`, or if the model's cost or one of its errors is None.
     """
     if not times or None in [model[key] for key in (COST, *times)]:
         return ""
@@ -76,9 +77,10 @@ def cheapest_grid(model: Method, grids: Sequence[Method], times: Mapping[str, st
 
 
 def break_even(first: float, each: float, rival_first: float, rival_each: float) -> float:
-    """Number of turnovers until a method has taken less time than a rival; infinite if its turnovers are not faster.
+    """Return the number of turnovers after which a method has taken less time than its rival.
 
-    `first` is the method's time in seconds before its first turnover, `each` its time for one turnover.
+    It is infinite if the method does not take less time for a turnover. `first` is the method's time in seconds before
+    its first turnover, and `each` its time for one turnover; `rival_first` and `rival_each` are those of the rival.
     """
     if each >= rival_each:
         return math.inf
@@ -86,9 +88,9 @@ def break_even(first: float, each: float, rival_first: float, rival_each: float)
 
 
 def _worse(row: Method, model: Method, key: str) -> bool:
-    """Whether the error `key` of a method exceeds the model's error by more than the larger of their two spreads.
+    """Return whether the error `key` of the method `row` exceeds the model's error by more than the larger spread.
 
-    A spread is the standard deviation of an error over realisations, or 0 if it is unknown.
+    The spread of an error is its standard deviation over realisations, or 0 if this is unknown.
     """
     spread = max(one.get(f"{key}_spread") or 0.0 for one in (row, model))
     return row[key] > model[key] + spread

@@ -8,19 +8,19 @@ FLOOR = 1e-6  # added to the probability of every bin, so that an empty bin does
 
 
 def bin_edges(half_width: float, bins: int) -> np.ndarray:
-    """Edges (bins + 1,) of equal bins over [-half_width, half_width]."""
+    """Return the edges (bins + 1,) of equal bins over [-half_width, half_width]."""
     return np.linspace(-half_width, half_width, bins + 1)
 
 
 def bin_centres(edges: np.ndarray) -> np.ndarray:
-    """Middle of each bin (bins,)."""
+    """Return the middle of each bin, (bins,)."""
     return (edges[1:] + edges[:-1]) / 2
 
 
 def bin_probabilities(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Fraction of the values, of any shape, in each bin (bins,); values beyond the ends count in the end bins.
+    """Return the fraction of the values in each bin, (bins,). Values beyond the ends count in the end bins.
 
-    Raises ValueError without values, or if one is not finite.
+    The values have any shape. Raises ValueError if there are none, or if one is not finite.
     """
     values = np.asarray(values, dtype=float).ravel()
     if values.size == 0 or not np.isfinite(values).all():
@@ -30,14 +30,15 @@ def bin_probabilities(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 
 def pdf(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Probability density (bins,); its integral over the bins is 1."""
+    """Return the probability density of the values in each bin, (bins,). Its integral over the bins is 1."""
     return bin_probabilities(values, edges) / np.diff(edges)
 
 
 def kl_divergence(truth: np.ndarray, prediction: np.ndarray) -> float:
-    """Forward Kullback-Leibler divergence sum p ln(p / q) of bin probabilities, truth p and prediction q (Eq. 14).
+    """Return the forward Kullback-Leibler divergence sum p ln(p / q) (the paper's Eq. 14).
 
-    FLOOR is added to every bin of both, which are then normalised again. Raises ValueError if the shapes differ.
+    p are the bin probabilities of the truth, and q those of the prediction. First FLOOR is added to every bin, and p
+    and q are normalised again. Raises ValueError if their shapes differ.
     """
     if truth.shape != prediction.shape:
         raise ValueError(f"the bins differ: {truth.shape} and {prediction.shape}")
@@ -47,17 +48,20 @@ def kl_divergence(truth: np.ndarray, prediction: np.ndarray) -> float:
 
 
 def sampling_divergence(rows: int, probabilities: Callable[[np.ndarray], np.ndarray]) -> float:
-    """Expected divergence between two independent samples of `rows` rows: the value of a perfect model.
+    """Return the expected divergence between two independent samples of `rows` rows. A perfect model has this value.
 
-    The divergence decreases as 1 / rows. So the estimate is half the divergence between two random halves of the
-    sample. `probabilities` maps row numbers to the bin probabilities of these rows.
+    `probabilities` maps row numbers of the one known sample to the bin probabilities of these rows. The divergence
+    decreases as 1 / rows. So the estimate is half the divergence between two random halves of the known sample.
     """
     shuffled = np.random.default_rng(0).permutation(rows)
     return kl_divergence(*(probabilities(half) for half in np.array_split(shuffled, 2))) / 2
 
 
 def standardized(values: np.ndarray, reference: np.ndarray | None = None) -> np.ndarray:
-    """(values - mean) / standard deviation, both of `reference` (default: the values). ValueError if it is constant."""
+    """Return (values - mean) / standard deviation, with the mean and the standard deviation of `reference`.
+
+    `reference` is by default `values`. Raises ValueError if it is constant.
+    """
     reference = values if reference is None else reference
     deviation = np.std(reference)
     if deviation == 0:
@@ -66,5 +70,5 @@ def standardized(values: np.ndarray, reference: np.ndarray | None = None) -> np.
 
 
 def gaussian(values: np.ndarray) -> np.ndarray:
-    """Density of the standard normal distribution."""
+    """Return the probability density of the standard normal distribution."""
     return np.exp(-(values**2) / 2) / np.sqrt(2 * np.pi)

@@ -6,19 +6,20 @@ from eddies.analysis.errors import rms_log_ratio
 
 
 def spectrum_error(energy: np.ndarray, reference: np.ndarray, largest_wavenumber: float) -> float:
-    """Root mean square of ln(E(k) / E_reference(k)) over the shells 1 <= k <= largest_wavenumber, at least over k = 1.
+    """Return the root mean square of ln(E(k) / E_reference(k)) over the shells 1 <= k <= largest_wavenumber.
 
-    `energy` and `reference` are (shells,), from k = 0 on. If the last shell has k < largest_wavenumber, the mean ends
-    there. The result is not finite if one of these shells is empty in `energy` or in `reference`.
+    `energy` and `reference` are (shells,), from k = 0 on. The shell k = 1 always counts. If the last shell has
+    k < largest_wavenumber, the mean ends there. The result is not finite if one of these shells has no energy in
+    `energy` or in `reference`.
     """
     shells = slice(1, _last_shell(largest_wavenumber, energy) + 1)
     return rms_log_ratio(energy[shells], reference[shells])
 
 
 def band_ratios(energy: np.ndarray, reference: np.ndarray, largest_wavenumber: float) -> dict[str, float]:
-    """Ratio of `energy` to `reference` in each of the bands of shells "1-2", "3-4", "5-8", ...
+    """Return the energy in each band of shells divided by that of the reference: "1-2", "3-4", "5-8", ...
 
-    All shells together are those of `spectrum_error`.
+    All bands together have the shells of `spectrum_error`, so the last band may be narrower.
     """
     last, ratios, first, end = _last_shell(largest_wavenumber, energy), {}, 1, 2
     while first <= last:
@@ -35,9 +36,9 @@ def _last_shell(largest_wavenumber: float, energy: np.ndarray) -> int:
 
 
 def vorticity(velocity: np.ndarray) -> np.ndarray:
-    """Vorticity curl u by spectral differentiation: (3, n, n, n) -> (3, n, n, n), components x, y, z.
+    """Return the vorticity curl u of a velocity u by spectral differentiation: (3, n, n, n) -> (3, n, n, n).
 
-    Derivatives of the Nyquist modes are set to zero, as a real field requires.
+    Components are x, y, z. Derivatives of the Nyquist modes are set to zero, as a real field requires.
     """
     cells = velocity.shape[-1]
     k = np.fft.fftfreq(cells, 1 / cells)
