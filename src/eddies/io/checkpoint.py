@@ -61,8 +61,8 @@ class Checkpoint(Mapping):
 
     @cached_property
     def content(self) -> dict[str, Any]:
-        """A dict of `step`, `format`, `fingerprint`, `computed_by`, `values` and `files`. `values` maps names to
-        the values that are not arrays; `files` maps file names to checksums."""
+        """All that is not an array: a dict of `step`, `format`, `fingerprint`, `computed_by`, `values` and `files`.
+        `values` maps the names of values to the values; `files` maps file names to checksums."""
         return json.loads(self.read(PLAIN).tobytes())
 
     @property
@@ -84,7 +84,7 @@ class Checkpoint(Mapping):
         return sum(1 for _ in self)
 
     def read(self, name: str, start: int = 0, stop: int | None = None, axis: int = 0) -> np.ndarray:
-        """Rows start, ..., stop - 1 of an array along an axis. Not collective: each rank reads what it needs."""
+        """Return rows start, ..., stop - 1 of an array along an axis. Not collective: each rank reads what it needs."""
         with open_to_read(self.path) as file:
             return file[name][(slice(None),) * axis + (slice(start, stop),)]
 
@@ -127,7 +127,7 @@ class CheckpointDirectory:
         in_files(self.comm, self.path, lambda: [old.unlink() for old in _newest_first(self.path)[KEPT:]])
 
     def newest(self) -> Checkpoint | None:
-        """The newest undamaged checkpoint with this fingerprint, or None. This checkpoint, its files and older
+        """Return the newest undamaged checkpoint with this fingerprint, or None. This checkpoint, its files and older
         checkpoints are kept; everything else in the directory is removed. A warning says why a newer one is not used.
 
         Raises ProductError, and removes nothing, if the system refuses to read a file: the file may be undamaged.
@@ -157,7 +157,7 @@ class CheckpointDirectory:
         in_files(self.comm, self.path, lambda: shutil.rmtree(self.path) if self.path.exists() else None)
 
     def _complaint(self, path: Path) -> str | None:
-        """Why a checkpoint cannot be used, or None; the same on all ranks."""
+        """Return why a checkpoint cannot be used, or None; the same on all ranks."""
         content = in_files(self.comm, path, lambda: _content(path))
         if content is None:
             return find_damage(self.comm, path) or f"{path}: is not a checkpoint"
@@ -183,8 +183,8 @@ class Guard:
     def __call__(self, run: Any, segments: FrameSegments | None = None) -> None:
         """Write a checkpoint if one is due; to be called before each step.
 
-        `run` has the step number `steps` and `state_dict()`; `segments` holds its frames. If the run has to stop, the
-        call raises Stopped after the checkpoint is complete.
+        `run` has the attribute `steps`, its step number, and the method `state_dict`; `segments` holds its frames. If
+        the run has to stop, the call raises Stopped after the checkpoint is complete.
         """
         stopping = self.stop()
         if self.stop.checkpoint_due:
@@ -203,7 +203,7 @@ class Guard:
 
 
 def checkpoints_in(path: Path) -> list[tuple[int, str]]:
-    """Step and fingerprint of each readable checkpoint in a directory, the newest first; on one rank.
+    """Return the step and the fingerprint of each readable checkpoint in a directory, the newest first; on one rank.
 
     The fingerprint is "" for a checkpoint of another format. ProductError if the system refuses to read a checkpoint.
     """
@@ -212,7 +212,7 @@ def checkpoints_in(path: Path) -> list[tuple[int, str]]:
 
 
 def _newest_first(directory: Path) -> list[Path]:
-    """The checkpoints in a directory, the newest first. In eddies 1.0 a checkpoint was a directory."""
+    """Return the checkpoints in a directory, the newest first. In eddies 1.0 a checkpoint was a directory."""
     paths = directory.iterdir() if directory.is_dir() else ()
     return sorted((path for path in paths if (name := NAME.fullmatch(path.name)) and path.is_dir() == (not name[2])),
                   key=_step_of, reverse=True)
@@ -223,7 +223,8 @@ def _step_of(path: Path) -> int:
 
 
 def _content(path: Path) -> dict[str, Any] | None:
-    """The content of a checkpoint; None if it is damaged. Raises ProductError if the system refuses to read it."""
+    """Return the content of a checkpoint; None if it is damaged. Raises ProductError if the system refuses to read
+    it."""
     try:
         with read_errors(path):
             return {"step": _step_of(path), "format": 0} if path.is_dir() else Checkpoint(path).content
@@ -236,7 +237,7 @@ def _content(path: Path) -> dict[str, Any] | None:
 
 
 def _computed_by() -> str:
-    """The kernels and the number of threads. The last bits of a result depend on them."""
+    """Return a text with the kernels and the number of threads. The last bits of a result depend on both."""
     return f"compiled kernels: {in_use()}, threads a rank: {threads()}"
 
 

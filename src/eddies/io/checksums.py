@@ -45,7 +45,7 @@ def open_to_read(path: str | Path) -> h5py.File:
 
     Raises:
         ContentError: the file is missing or not an HDF5 file, its checksums are missing, or bytes differ from them.
-            Later reads raise it too.
+            Later reads from the file raise this error, too.
         ProductError: the system refuses to open the file.
     """
     with read_errors(path):
@@ -78,8 +78,8 @@ class CheckedFile(io.FileIO):
         return super().seek(offset + self._size) if whence == os.SEEK_END else super().seek(offset, whence)
 
     def readinto(self, buffer: memoryview) -> int:
-        """Fill a buffer with the bytes from the present position on. Raises ContentError if bytes differ from their
-        checksums. The position does not change, because h5py sets it before each read."""
+        """Fill a buffer with the bytes from the present position on, and return their number. Raises ContentError if
+        bytes differ from their checksums. The position stays as it was, because h5py sets it before each read."""
         at, done = self.tell(), 0
         size = min(len(buffer), self._size - at)
         while done < size:
@@ -95,7 +95,7 @@ class CheckedFile(io.FileIO):
 
 
 def add_checksums(comm: MPI.Comm, path: Path) -> None:
-    """Append checksums to a file that all ranks have closed; collective. Raises WriteError on all ranks if it fails."""
+    """Append checksums to a file that all ranks have closed; collective. If this fails, all ranks raise WriteError."""
     from eddies.parallel.broadcast import on_all_ranks, on_first_rank
     from eddies.parallel.reduction import global_sum
     comm.Barrier()  # all ranks have closed the file
@@ -120,7 +120,7 @@ def add_checksums(comm: MPI.Comm, path: Path) -> None:
 
 
 def table_checksum(path: Path) -> int | None:
-    """A checksum of all checksums of a file, which identifies the file; None if it has no checksums."""
+    """Return one checksum over all checksums of a file, to identify the file; None if the file has no checksums."""
     with _opened(path) as descriptor:
         size = _covered_bytes(descriptor)
         return None if size is None else zlib.crc32(_read_table(descriptor, 0, _count_blocks(size), size), size)
@@ -129,9 +129,9 @@ def table_checksum(path: Path) -> int | None:
 def find_damage(comm: MPI.Comm, path: Path, known: int | None = None) -> str | None:
     """Compare a file with its checksums; collective.
 
-    Returns a text that names file, dataset and frame of the first damage; None if there is no damage. `known` is the
-    result of `table_checksum` for the expected file; if it is None, any file with valid checksums is accepted. Raises
-    ProductError on all ranks if the system refuses to read the file. It is then unknown whether the file is damaged.
+    Returns a text that names the file, the dataset and the frame of the first damage, or None if there is no damage.
+    `known` is the result of `table_checksum` for the expected file; if it is None, any file with valid checksums is
+    accepted. If the system refuses to read the file, so that damage remains unknown, all ranks raise ProductError.
     """
     from eddies.parallel.broadcast import on_all_ranks, on_first_rank
     from eddies.parallel.reduction import global_min
@@ -174,14 +174,15 @@ def _count_blocks(size: int) -> int:
 
 
 def _covered_bytes(descriptor: int) -> int | None:
-    """The number of bytes that the checksums cover; None if the file has no checksums."""
+    """Return the number of bytes that the checksums cover; None if the file has no checksums."""
     end = os.fstat(descriptor).st_size - FOOTER.size
     size, mark = FOOTER.unpack(os.pread(descriptor, FOOTER.size, end)) if end > 0 else (0, b"")
     return size if mark == MARK and size + 4 * _count_blocks(size) == end else None
 
 
 def _own_pieces(comm: MPI.Comm, size: int) -> Iterator[tuple[int, memoryview]]:
-    """Divide this rank's blocks into pieces. Yields the number of each piece's first block, and a buffer for it."""
+    """Divide this rank's blocks of the first `size` bytes of a file into pieces. Yield for each piece the number of its
+    first block and a buffer for its bytes."""
     from eddies.parallel.slab import block_starts
     start, stop = map(int, block_starts(_count_blocks(size), comm.size)[comm.rank:comm.rank + 2])
     buffer = memoryview(bytearray(PIECE * BLOCK_BYTES))
@@ -190,14 +191,14 @@ def _own_pieces(comm: MPI.Comm, size: int) -> Iterator[tuple[int, memoryview]]:
 
 
 def _first_wrong(descriptor: int, first: int, part: memoryview, size: int, skipped: int = 0) -> int | None:
-    """Fill `part` as `_read_sums` does. Returns the number of the first block with a wrong checksum, or None."""
+    """Fill `part` as `_read_sums` does. Return the number of the first block with a wrong checksum, or None."""
     sums = _read_sums(descriptor, first, part, size, skipped)
     wrong = np.flatnonzero(sums != _read_table(descriptor, first, first + len(sums), size))
     return first + int(wrong[0]) if wrong.size else None
 
 
 def _read_table(descriptor: int, first: int, last: int, size: int) -> np.ndarray:
-    """The stored checksums of the blocks first, ..., last - 1."""
+    """Return the stored checksums of the blocks first, ..., last - 1. They cover the first `size` bytes of the file."""
     return np.frombuffer(os.pread(descriptor, 4 * (min(last, _count_blocks(size)) - first), size + 4 * first), "<u4")
 
 
@@ -221,7 +222,7 @@ def _damage(path: Path, block: int, naming: bool = True) -> str:
 
 
 def _place(path: Path, start: int, stop: int) -> str:
-    """Names of the datasets and frames that have bytes between `start` and `stop` of a file."""
+    """Return the names of the datasets and frames that have bytes between `start` and `stop` of a file."""
     names: list[str] = []
 
     def look(name: str, item: h5py.Group | h5py.Dataset) -> None:
@@ -240,7 +241,7 @@ def _place(path: Path, start: int, stop: int) -> str:
 
 
 def _extents(dataset: h5py.Dataset) -> Iterator[tuple[int, int, int]]:
-    """Yield first row, offset in the file and number of bytes of each contiguous part of a dataset."""
+    """Yield, for each contiguous part of a dataset, its first row, its offset in the file and its number of bytes."""
     if dataset.chunks is None:
         if dataset.id.get_offset() is not None:
             yield 0, dataset.id.get_offset(), dataset.nbytes

@@ -43,14 +43,14 @@ class Array(BackendArray):
 
 
 def known_array(place: str, values: np.ndarray) -> Array:
-    """An array with known values. Its attributes are those of the dataset at the path `place` in rollout.h5."""
+    """Return an array whose values are in memory. Its attributes are those of the dataset `place` in rollout.h5."""
     return Array(values.shape, values.dtype, dataset_attributes("rollout", place), values.__getitem__)
 
 
 def computed_array(place: str, shape: tuple[int, ...], dtype: np.dtype,
                    make: Callable[[Sequence[int]], Sequence[np.ndarray]]) -> Array:
-    """An array whose frames are computed when they are used. The first axis is that of the frames, and `make` returns
-    the frames with the given indices. Attributes are those of the dataset at the path `place` in rollout.h5."""
+    """Return an array whose frames are computed when they are used. The first axis counts the frames, and `make`
+    returns the frames with the given indices. The attributes are those of the dataset `place` in rollout.h5."""
     def read(part: tuple) -> np.ndarray:
         first, *others = part or (slice(None),)
         frames = np.arange(shape[0])[first]
@@ -63,9 +63,9 @@ def computed_array(place: str, shape: tuple[int, ...], dtype: np.dtype,
 
 
 def open_group(path: Path, name: str) -> Any:
-    """The arrays of a group of a product, by name. A column of a trajectory is represented by its dataset `value`.
+    """Return the arrays in the group `name` of a product. A column of a trajectory appears as its dataset `value`.
 
-    ProductError if there is no such group or file.
+    Raises ProductError if there is no such group or file.
     """
     def read(array: str, part: tuple) -> np.ndarray:
         with open_to_read(path) as file:
@@ -83,7 +83,7 @@ def open_group(path: Path, name: str) -> Any:
 
 
 def groups_in(file: h5py.File) -> list[str]:
-    """The names of the groups that hold arrays, without the columns and boxes of trajectories."""
+    """Return the names of the groups that hold arrays, without the columns and boxes of trajectories."""
     names = []
 
     def look(name: str, item: h5py.Group | h5py.Dataset) -> None:
@@ -96,8 +96,8 @@ def groups_in(file: h5py.File) -> list[str]:
 
 
 def as_dataset(arrays: Mapping[str, Array], attributes: Mapping[str, Any]) -> Any:
-    """An xarray Dataset with these arrays. Times, ids, wavenumbers and points become coordinates. If xarray is not
-    installed, a dictionary of numpy arrays."""
+    """Return an xarray Dataset with these arrays, or a dictionary of numpy arrays if xarray is not installed. In the
+    Dataset, times, ids, wavenumbers and points are coordinates."""
     if xarray is None:
         return {key: array.read(()) for key, array in arrays.items()}
     variables, coordinates = {}, {}

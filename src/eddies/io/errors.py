@@ -20,7 +20,7 @@ class ProductError(UserError, RuntimeError):
 
 
 class ContentError(ProductError):
-    """A file is missing, damaged or not an HDF5 file. After any other ProductError the file may be undamaged."""
+    """A file is missing, damaged or not an HDF5 file. With any other ProductError the file may be undamaged."""
 
 
 class WriteError(ProductError):
@@ -29,7 +29,8 @@ class WriteError(ProductError):
 
 
 def write_error(path: Path | str, error: OSError, wanted: int = 0) -> WriteError:
-    """The error for a file that cannot be written, read or removed. `wanted`: bytes to write, 0 if unknown."""
+    """Return the error for a file that cannot be written, read or removed. `wanted` is the number of bytes to write, or
+    0 if it is unknown."""
     reason = error.strerror or error
     if error.errno in NO_ROOM:
         return WriteError(f"{path}: cannot be written: {reason}: {space_in_words(path, wanted)}; make room, then run "
@@ -47,7 +48,8 @@ def file_errors(path: Path | str, wanted: int = 0) -> Iterator[None]:
 
 
 def space_in_words(path: Path | str, wanted: int) -> str:
-    """Text with the free bytes of a file system and, unless `wanted` is 0, the bytes wanted for the file at `path`."""
+    """Return a text that says how many bytes are free on the file system of `path` and, unless `wanted` is 0, how many
+    are wanted."""
     disk = os.statvfs(next(place for place in Path(path).absolute().parents if place.is_dir()))
     free = disk.f_bavail * disk.f_frsize
     if disk.f_files and not disk.f_favail:
@@ -71,6 +73,6 @@ def read_errors(path: Path | str) -> Iterator[None]:
 
 
 def remedy_for(kind: str, file: str = "it") -> str:
-    """The remedy, in words, for a product of a `kind` that cannot be used. The stage that makes such a product
-    keeps an existing file, so the user has to remove it. `file` is the text that names the file."""
+    """Return the remedy, in words, for a product of this `kind` that cannot be used. The stage that makes such a
+    product keeps an existing file, so the user has to remove it. `file` is the text that names the file."""
     return f"remove {file} and run `eddies {MAKER_OF[kind].name}` again" if kind in MAKER_OF else "make it again"

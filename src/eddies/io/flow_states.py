@@ -82,11 +82,13 @@ class VelocityCubes:
         return len(self._states)
 
     def read(self, index: int, variable: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Planes start, ..., stop - 1 of the velocity, (3, stop - start, y, x). ProductError if one is damaged."""
+        """Return planes start, ..., stop - 1 of the velocity, (3, stop - start, y, x). ProductError if one is
+        damaged."""
         return np.concatenate([_read_planes(dataset, start, stop) for dataset in self._states[index]])
 
     def check(self, comm: MPI.Comm, index: int, velocity: np.ndarray) -> None:
-        """Raise ProductError if `velocity`, on this rank's planes, is uniform, too large or incomplete; collective."""
+        """Raise ProductError if the velocity of a state is uniform, too large or incomplete; collective. `velocity`
+        holds this rank's planes of the state."""
         dataset = self._states[index][0]
         own = [np.ravel(dataset.attrs[name]) for name in FILL_ATTRIBUTES if name in dataset.attrs]
         fills = dict.fromkeys([*NOT_DELIVERED, *(float(value[0]) for value in own
@@ -109,7 +111,8 @@ class VelocityCubes:
 
 @contextmanager
 def open_states(comm: MPI.Comm, path: Path) -> Iterator[StoredStates | VelocityCubes]:
-    """The states of the whole flow in a file; collective. If one rank cannot read it, all ranks raise ProductError.
+    """Yield the states of the whole flow in a file; collective. If one rank cannot read it, all ranks raise
+    ProductError.
 
     A ground truth with tracers holds states at a few times; one without tracers holds only its last state.
     """
@@ -122,7 +125,7 @@ def open_states(comm: MPI.Comm, path: Path) -> Iterator[StoredStates | VelocityC
 
 
 def _is_product(path: Path) -> bool:
-    """Whether a file is a product of eddies. ProductError if it is missing or not an HDF5 file."""
+    """Return whether a file is a product of eddies. ProductError if it is missing or not an HDF5 file."""
     if not path.is_file():
         raise ProductError(f"{path.absolute()}: {'is not a regular file' if path.exists() else 'no such file'}; make "
                            "it with `eddies dns SCENE`, or correct [initial] path, which is searched in the working "
@@ -190,7 +193,7 @@ def _fluidsim_state(file: h5py.File) -> VelocityCubes:
 
 
 def _dataset(file: h5py.File, name: str) -> h5py.Dataset:
-    """The dataset with this name. ProductError if it is something else, or if its values cannot be read."""
+    """Return the dataset with this name. ProductError if it is something else, or if its values cannot be read."""
     try:
         item = file[name]
     except KeyError as error:
@@ -214,7 +217,7 @@ def _dataset(file: h5py.File, name: str) -> h5py.Dataset:
 
 
 def _read_planes(dataset: h5py.Dataset, start: int, stop: int | None) -> np.ndarray:
-    """Planes of a vector or of one component, (components, z, y, x)."""
+    """Return planes start, ..., stop - 1 of a vector or of one component, (components, z, y, x)."""
     try:
         values = dataset[start:stop]
     except OSError as error:
@@ -229,9 +232,10 @@ def _place(dataset: h5py.Dataset) -> str:
 
 
 def read_spectrum(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Ascending wavenumbers k > 0 and energies E(k) >= 0 from a text file with one pair a line; # begins a comment.
+    """Read ascending wavenumbers k > 0 and energies E(k) >= 0 from a text file with one pair in each line. # begins a
+    comment. Only one rank calls this function.
 
-    One rank calls it. Raises ProductError if the file holds something else.
+    Raises ProductError if the file holds something else.
     """
     try:
         with read_errors(path), warnings.catch_warnings(action="ignore"):  # numpy warns of an empty file

@@ -1,4 +1,5 @@
-"""Segments: files of frames. They are closed at each checkpoint, so that a later failure cannot damage them."""
+"""Segments, which are files with frames. They are closed at each checkpoint, so that a later failure cannot damage
+them."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ class FieldLayout:
 
 @dataclass(frozen=True)
 class TrajectoryLayout:
-    """The content of the frames of particles."""
+    """The content of a trajectory, a series of frames of particles."""
 
     total: int  # number of particles
     columns: Mapping[str, tuple[int, ...]]  # shape of one particle's value in each column
@@ -62,7 +63,7 @@ class FrameSegments:
     """The files frames-NNNNNNNN.h5 of a directory, named after their first step; `names` lists the closed files.
     The first closed file may be a product with the same series.
 
-    If the context ends with an exception, the open segment is removed. `assemble` copies frames into a product.
+    If the `with` block ends with an exception, the open segment is removed. `assemble` copies frames into a product.
     """
 
     def __init__(self, comm: MPI.Comm, directory: Path, layout: FrameLayout, names: Sequence[str] = ()) -> None:
@@ -86,7 +87,8 @@ class FrameSegments:
             self._name = ""
 
     def first_frames(self, name: str, count: int) -> list[tuple[float, dict[str, np.ndarray]]]:
-        """Time and columns of the first `count` frames of a trajectory in closed segments; only this rank's rows."""
+        """Return the times and columns of the first `count` frames of the trajectory `name` in closed segments. The
+        columns hold only this rank's rows."""
         frames: list[tuple[float, dict[str, np.ndarray]]] = []
         for segment in self.names[:count]:  # each segment holds one frame or more
             with open_product(self.comm, self.directory / segment, None) as file:
@@ -120,6 +122,6 @@ class FrameSegments:
         self._file.__exit__(*raised)
 
     def _values(self, frames: Trajectory, frame: int) -> dict[str, np.ndarray]:
-        """This rank's block of all columns of a frame."""
+        """Return this rank's rows of all columns of a frame, by name of the column."""
         block = id_block(self.comm, frames.total)
         return {column: frames.read(frame, column, *block) for column in frames.columns}

@@ -44,10 +44,11 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
                    provenance: Mapping[str, Any]) -> Iterator[h5py.File]:
     """Write a product, all ranks together. It appears under `path` after the block has ended without an exception.
 
-    `provenance` (the scene's text, its fingerprint, ...; JSON-able) is stored with the versions of all libraries, the
-    number of ranks, the date and an id. Its `made_from` lists kinds of products; the ids of such products in the same
-    directory are stored. If `provenance` holds an `id`, the product gets this id, not a new one. A file
-    that replaces a product can thus keep its id, which other products may name as their origin.
+    `provenance` holds the scene's text, its fingerprint and more, and must be possible to write as JSON. It is stored
+    with the versions of all libraries, the number of ranks, the date and a new id. If it holds `made_from`, a list of
+    kinds of products, the ids of these products in the same directory are stored instead of the list. If it holds `id`,
+    the product gets this id, not a new one. A file that replaces a product can thus keep the id of that product, which
+    other products may name as their origin.
 
     Raises:
         WriteError: on all ranks; the file cannot be written or renamed.
@@ -67,7 +68,8 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
 
 @contextmanager
 def open_product(comm: MPI.Comm, path: str | Path, kind: str | None) -> Iterator[h5py.File]:
-    """Open a complete product to read it. `kind` None allows any kind. If one rank cannot open it, all ranks raise.
+    """Open a complete product to read it. `kind` None allows any kind. If one rank cannot open it, all ranks raise an
+    error.
 
     Raises:
         ProductError: the file is missing, truncated, not an HDF5 file, unfinished, or of another kind or format.
@@ -77,7 +79,7 @@ def open_product(comm: MPI.Comm, path: str | Path, kind: str | None) -> Iterator
 
 
 def read_attributes(file: h5py.Group, name: str) -> dict[str, Any]:
-    """The attributes of a group as Python values; ProductError if there is no such group."""
+    """Return the attributes of a group as Python values; ProductError if there is no such group."""
     return {key: python_value(value) for key, value in find_group(file, name).attrs.items()}
 
 
@@ -102,7 +104,7 @@ def read_table(file: h5py.Group, name: str) -> dict[str, np.ndarray]:
 
 
 def find_group(file: h5py.Group, name: str) -> h5py.Group:
-    """The group `name`. If there is no such group, a ProductError lists what `file` holds."""
+    """Return the group `name`. If there is no such group, raise a ProductError that lists what `file` holds."""
     group = file.get(name)
     if not isinstance(group, h5py.Group):
         raise ProductError(f"{file.file.filename}: holds no {name}; its group {file.name} holds "
@@ -111,9 +113,9 @@ def find_group(file: h5py.Group, name: str) -> h5py.Group:
 
 
 def stored_numbers(file: h5py.File) -> Iterator[tuple[str, int | None, np.ndarray]]:
-    """Yield place, frame and values of the floating-point numbers of an open product.
+    """Yield the floating-point numbers of an open product, as the name of their place, the frame and the values.
 
-    A series gives only its last frame. For all other numbers, attributes included, the frame is None.
+    Of a series, only the last frame is yielded. For all other numbers, attributes included, the frame is None.
     """
     names: list[str] = []
     file.visit(names.append)
@@ -185,7 +187,7 @@ def read_frame(dataset: h5py.Dataset, frame: int, selection: tuple[slice, ...], 
 
 
 def read_times(dataset: h5py.Dataset) -> np.ndarray:
-    """The times of a series; ProductError if they do not increase."""
+    """Return the times of a series; ProductError if they do not increase."""
     times = dataset[()]
     if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
         raise unfit(dataset, "holds times that do not increase")
@@ -193,7 +195,7 @@ def read_times(dataset: h5py.Dataset) -> np.ndarray:
 
 
 def unfit(dataset: h5py.Dataset, problem: str) -> ProductError:
-    """The error for a dataset with content that no stage writes."""
+    """Return the error for a dataset with content that no stage writes."""
     return ProductError(f"{dataset.file.filename}: {dataset.name}, {problem}; {remedy_for(dataset.file.attrs['kind'])}")
 
 
@@ -216,7 +218,8 @@ def _open_checked(path: Path, kind: str | None) -> h5py.File:
 
 
 def _problem(file: h5py.File, kind: str | None, remedy: str) -> str | None:
-    """Why an open file is not a complete product of a kind, with the remedy; None if it is one."""
+    """Return why an open file is not a complete product of this `kind`, with a remedy; None if it is one. `remedy` is
+    the remedy for a file of another kind and for an unfinished file."""
     try:
         stored, complete = str(file.attrs.get("kind", "unknown")), bool(file.attrs.get("complete", False))
     except (OSError, TypeError, ValueError) as error:

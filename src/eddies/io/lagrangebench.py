@@ -21,20 +21,20 @@ from eddies.io.new_files import create_export, write_files
 from eddies.io.trajectories import Trajectory
 
 SPLITS = ("train", "valid", "test")
-FRAMES_OF_A_SPLIT = 3  # smallest number, because an acceleration needs three frames
+FRAMES_OF_A_SPLIT = 3  # the smallest number, because an acceleration needs three frames
 FLUID = 0  # the type of all particles
 CONNECTIVITY = 1.45  # radius of pairs in the data sets of LagrangeBench, divided by the mean distance of particles
 SMALLEST_DEVIATION = 1e-7  # a smaller standard deviation is stored as 1, because LagrangeBench divides by it
 
 
 def split_frames(frames: int) -> list[int]:
-    """Numbers of frames for train, valid and test, about 2 : 1 : 1 as in LagrangeBench."""
+    """Return the numbers of frames for train, valid and test, about 2 : 1 : 1 as in LagrangeBench."""
     held_out = math.ceil(frames / 4)
     return [frames - 2 * held_out, held_out, held_out]
 
 
 def shortcoming(trajectory: Trajectory) -> str | None:
-    """Why a trajectory cannot become a data set; None if it can."""
+    """Return why a trajectory cannot become a data set; None if it can."""
     times = trajectory.times
     if min(split_frames(len(times))) < FRAMES_OF_A_SPLIT:
         return f"it has {len(times)} frames, too few for three parts of at least {FRAMES_OF_A_SPLIT}"
@@ -86,7 +86,8 @@ def _copy_frames(trajectory: Trajectory, start: int, positions: h5py.Dataset) ->
 
 
 def _statistics(moments: np.ndarray) -> dict[str, list[float]]:
-    """Mean and standard deviation of velocity and acceleration from the moments (parts, 2, 2, 3) of `_copy_frames`."""
+    """Return the means and standard deviations of velocity and acceleration, by their names in metadata.json. `moments`
+    (parts, 2, 2, 3) holds the result of `_copy_frames` for each part."""
     statistics = {}
     for name, (mean, square) in zip(("vel", "acc"), moments.mean(axis=0)):
         deviation = np.sqrt(np.maximum(square - mean**2, 0))

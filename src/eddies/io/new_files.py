@@ -7,7 +7,7 @@ leaves the former file as it was. There are two ways to write:
 - `new_file`: an HDF5 file, by all ranks together; `create_export` uses it for files that other programs read.
 
 HDF5 does not survive a write that fails: it crashes when it closes the file, or ranks wait for each other for ever.
-Measures 1 and 2 prevent this. Measure 3 is for an h5py that is built without MPI, such as its wheels:
+Measures 1 and 2 prevent this. Measure 3 is for an h5py that was built without MPI, such as the one of its wheels:
 
 1. Each write is announced by `writing`, which reserves the space on the disk first. If there is too little, all ranks
    raise WriteError before HDF5 writes; the file can then be closed and removed. A margin stays reserved for what HDF5
@@ -51,7 +51,7 @@ LARGEST_BYTES = 4 * 10**9
 REMEDY = ("run on one rank, or build h5py with MPI: `CC=mpicc HDF5_MPI=ON pip install --no-binary=h5py "
           "--no-build-isolation h5py`")
 
-Layout = Mapping[str, tuple[tuple[int, ...], Any]]  # shape and type of each large dataset
+Layout = Mapping[str, tuple[tuple[int, ...], Any]]  # shape and type of each large dataset, by its path
 
 # The files that are being written, by their names in HDF5.
 _open: dict[str, _NewFile] = {}
@@ -146,20 +146,21 @@ def writing(group: h5py.Group | h5py.Dataset, size: int) -> Iterator[None]:
 
 
 def writing_failed() -> bool:
-    """Whether HDF5 failed to write a file. The process then crashes at its end unless it is aborted."""
+    """Return whether HDF5 failed to write a file. The process then crashes at its end unless it is aborted."""
     return any(new.broken for new in _abandoned)
 
 
 def has_single_writer(comm: MPI.Comm) -> bool:
-    """Whether rank 0 writes for several ranks, because h5py is built without MPI."""
+    """Return whether rank 0 writes for several ranks, because h5py is built without MPI."""
     return comm.size > 1 and not h5py.get_config().mpi
 
 
 def own_part(group: h5py.Group | h5py.Dataset, shape: tuple[int, ...], block: np.ndarray,
              offset: tuple[int, ...]) -> tuple[np.ndarray, tuple[int, ...]]:
-    """The part of an array of this `shape` that this rank writes, and the offset of the part; collective.
+    """Return the part of an array of this `shape` that this rank writes, and the offset of the part; collective.
 
-    The part is the rank's block. If rank 0 writes for all, the part is the whole array on rank 0, and empty on others.
+    The part is this rank's `block` at `offset`. If rank 0 writes for all ranks, the part is the whole array on rank 0
+    and empty on the other ranks.
     """
     comm = _open[group.file.filename].comm
     if not has_single_writer(comm) or not shape:
@@ -182,7 +183,7 @@ def own_part(group: h5py.Group | h5py.Dataset, shape: tuple[int, ...], block: np
 
 
 def frame_bytes(dataset: h5py.Dataset) -> int:
-    """An upper limit of the bytes by which a file grows when a chunked dataset gets one more frame."""
+    """Return an upper limit of the bytes by which a file grows when a chunked dataset gets one more frame."""
     if dataset.shape[0] % dataset.chunks[0]:
         return 0
     chunks = math.prod(-(-extent // chunk) for extent, chunk in zip(dataset.shape[1:], dataset.chunks[1:]))
@@ -228,16 +229,16 @@ class _NewFile:
         return not self.broken
 
     def is_own(self) -> bool:
-        """Whether the file is still the one that this job created."""
+        """Return whether the file is still the one that this job created."""
         return self.path.exists() and self.path.stat().st_ino == self._inode
 
     def remove(self) -> None:
-        """Remove the closed file."""
+        """Remove the closed file, if it is still the one that this job created."""
         if self.is_own():
             self.path.unlink()
 
     def publish(self, path: Path) -> None:
-        """Give the closed file its name."""
+        """Give the closed file its final name, `path`. Raises RunTakenOver if it is no longer this job's file."""
         if not self.is_own():
             raise RunTakenOver(path)
         os.replace(self.path, path)

@@ -27,14 +27,15 @@ LIBRARIES = ("numpy", "mpi4py", "h5py", "pyfftw", "torch")
 
 
 def environment(ranks: int) -> dict[str, object]:
-    """Versions of this package and its libraries, commit of the checkout, kernels in use, number of ranks, date."""
+    """Return the versions of this package and its libraries, the commit of the checkout, the kernels in use, the number
+    of ranks and the date."""
     return {"eddies": eddies.__version__, "commit": commit(), "libraries": versions(), "kernels": in_use(),
             "ranks": ranks, "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")}
 
 
 @functools.cache  # finding the versions reads long files of the installation
 def versions() -> dict[str, str]:
-    """Versions of Python, HDF5, MPI and the installed libraries."""
+    """Return the versions of Python, HDF5, MPI and the installed libraries."""
     found = {"python": platform.python_version(), "hdf5": h5py.version.hdf5_version,
              "mpi": MPI.Get_library_version().strip("\0 \n").split("\n")[0]}
     for library in LIBRARIES:
@@ -46,7 +47,8 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str | None:
-    """The git commit of the checkout that this package runs from, or None. No process is started: MPI may forbid it."""
+    """Return the git commit of the checkout that this package runs from, or None. No process is started, because MPI
+    may forbid it."""
     git = Path(eddies.__file__).parents[2] / ".git"
     try:
         head = (git / "HEAD").read_text().strip()
@@ -62,36 +64,37 @@ def commit() -> str | None:
 
 
 def product_ids(directory: Path, kinds: Iterable[str]) -> dict[str, str | None]:
-    """The ids of the products of these kinds in a directory, by kind. A missing or unreadable product is left out. The
-    value is None if a product has no id."""
+    """Return the ids of the products of these kinds in a directory, by kind. A missing or unreadable product is left
+    out. The value is None if a product has no id."""
     beside = {kind: product_provenance(directory / MAKER_OF[kind].file) for kind in kinds}
     return {kind: origin.get("id") for kind, origin in beside.items() if origin}
 
 
 def product_provenance(path: str | Path) -> dict[str, Any]:
-    """`read_provenance` of a complete product of this format; empty if there is no such product."""
+    """Return the provenance of a complete product of this format; empty if there is no such product."""
     return _read_sound(path, read_provenance)
 
 
 def product_attributes(path: str | Path, group: str) -> dict[str, Any]:
-    """The attributes of a group of a complete product of this format; empty if there is no such product."""
+    """Return the attributes of a group of a complete product of this format; empty if there is no such product."""
     return _read_sound(path, lambda file: dict(file[group].attrs))
 
 
 def product_fingerprint(path: str | Path) -> str | None:
-    """The scene's fingerprint in a complete product of this format; None if there is no such product."""
+    """Return the scene's fingerprint in a complete product of this format; None if there is no such product."""
     return product_provenance(path).get("fingerprint")
 
 
 def others_trained_on(origin: Mapping[str, Any]) -> list[str]:
-    """Paths of the ground truths that a model was trained on; empty if the ground truth of its own run is among them.
-    `origin` is the model's provenance."""
+    """Return the paths of the ground truths that a model was trained on; empty if the ground truth of the model's own
+    run is among them. `origin` is the model's provenance."""
     truths = origin.get("truths", {})
     return [] if origin.get("made_from", {}).get("ground_truth") in truths.values() else list(truths)
 
 
 def read_provenance(file: h5py.File) -> dict[str, Any]:
-    """Scene text, fingerprint, versions, ranks, date, id and `made_from` of an open product; old products have no id.
+    """Return the scene's text, fingerprint, versions, number of ranks, date, id and `made_from` of an open product.
+    Old products have no id.
 
     Raises ProductError if the provenance is damaged.
     """
@@ -103,7 +106,7 @@ def read_provenance(file: h5py.File) -> dict[str, Any]:
 
 
 def read_json(file: h5py.File, name: str) -> dict[str, Any]:
-    """The dict that an attribute of an open product holds as JSON; ProductError if it holds none."""
+    """Return the dict that an attribute of an open product holds as JSON; ProductError if it holds none."""
     try:
         found = json.loads(file.attrs[name])
     except (KeyError, TypeError, ValueError, OSError):
@@ -114,7 +117,7 @@ def read_json(file: h5py.File, name: str) -> dict[str, Any]:
 
 
 def has_this_format(file: h5py.File) -> bool:
-    """Whether an open product has the format that this version reads."""
+    """Return whether an open product has the format that this version reads."""
     return bool(np.array_equal(file.attrs.get("format", 1), FORMAT))
 
 
@@ -132,7 +135,7 @@ def _damaged(file: h5py.File, name: str) -> ProductError:
 
 
 def read_metrics(path: Path) -> dict[str, Any]:
-    """The numbers of a report, by section. Raises ProductError if the file is damaged."""
+    """Return the numbers of a report, by section. Raises ProductError if the file is damaged."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except ValueError:

@@ -122,23 +122,25 @@ QUANTITIES = {
 
 
 def conventions(kind: str) -> dict[str, str]:
-    """Attributes of a product that state its units, box and origin of time; empty for a product without a flow."""
+    """Return the attributes of a product in which users find the units, the box and the origin of time. The result is
+    empty for a product without a flow."""
     return {**CONVENTIONS, "time_origin": ORIGINS[kind]} if kind in ORIGINS else {}
 
 
 def python_value(value: Any) -> Any:
-    """A number or text of an attribute as a Python object."""
+    """Return a number or text of an attribute as a Python object."""
     return value.item() if isinstance(value, np.generic) else value
 
 
 def describe(dataset: h5py.Dataset) -> None:
-    """Write the attributes `units`, `axes` and `description` of a known dataset; collective."""
+    """Write the attributes `units`, `axes` and `description` of a dataset, if its path is known; collective."""
     for name, words in dataset_attributes(dataset.file.attrs.get("kind", ""), dataset.name.strip("/")).items():
         dataset.attrs[name] = words
 
 
 def dataset_attributes(kind: str, path: str) -> dict[str, str]:
-    """Units, axes and description of the dataset at a path in a product of a kind; empty if the path is unknown."""
+    """Return `units`, `axes` and `description` of the dataset at `path` in a product of this `kind`; empty if the path
+    is unknown."""
     group, _, name = path.rpartition("/")
     quantity = next((each for pattern, each in QUANTITIES.items() if fnmatchcase(path, pattern)), None)
     if quantity is None and name == "time":

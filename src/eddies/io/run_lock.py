@@ -1,7 +1,8 @@
 """One job at a time in a run directory.
 
-A file LOCK names the job that works there, as JSON. Its modification time is the job's last sign of life, which a
-thread renews. A job holds the directory as long as LOCK names it. If LOCK names another job or is gone, the job ends.
+A file LOCK names the job that works there, as JSON. The modification time of LOCK is the job's last sign of life; a
+thread of the job renews it. A job holds the directory as long as LOCK names this job. If LOCK names another job or is
+gone, the job ends.
 """
 
 from __future__ import annotations
@@ -64,16 +65,16 @@ class Holder:
 
     @classmethod
     def this_job(cls) -> Holder:
-        """The job of this process."""
+        """Return the `Holder` for the job of this process."""
         restarts = os.environ.get("SLURM_RESTART_COUNT", "")
         return cls(uuid.uuid4().hex, socket.gethostname(), _machine(), os.getpid(), _born(os.getpid()),
                    os.environ.get("SLURM_JOB_ID", ""), int(restarts) if restarts.isdecimal() else 0,
                    datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"))
 
     def lives(self) -> bool | None:
-        """Whether the job still runs; None if that cannot be known here.
+        """Return whether the job still runs; None if this cannot be known here.
 
-        It is known on the machine of the job. A requeued Slurm job also knows that its earlier run has ended.
+        This is known on the machine of the job. A requeued Slurm job also knows that its earlier run has ended.
         """
         own = self.this_job()
         if self.batch and self.batch == own.batch and self.restarts < own.restarts:
@@ -116,7 +117,7 @@ class FoundLock:
 
 class RunLock:
     """The lock that this job holds, on rank 0. A thread gives signs of life. `made` says whether the job has made the
-    directory; if so, `release` removes the directory if it is empty."""
+    directory; `release` then removes the directory, unless it holds files."""
 
     def __init__(self, directory: Path, holder: Holder, made: bool) -> None:
         self.directory, self.path, self.holder, self.made = directory, directory / LOCK, holder, made
@@ -127,7 +128,8 @@ class RunLock:
         self._signs.start()
 
     def lock_lost(self) -> RunTakenOver | None:
-        """The error to raise if another job has taken over the directory, else None. Looks at most once a second."""
+        """Return the error to raise if another job has taken over the directory, else None. LOCK is read at most once a
+        second."""
         now = time.monotonic()
         if self._lost is None and now >= self._next_look:
             self._next_look = now + LOOK_SECONDS
@@ -158,7 +160,7 @@ class RunLock:
 
 @contextlib.contextmanager
 def lock_directory(comm: MPI.Comm, directory: Path, take_over: bool = False) -> Iterator[LockLoss]:
-    """Hold a run directory, which is made if it is missing; collective.
+    """Hold a run directory inside the block; collective. The directory is made if it is missing.
 
     Yields `RunLock.lock_lost` on rank 0, and on other ranks a function that returns None. A stale lock is replaced.
     With `take_over`, any lock is replaced; the job that held the directory then ends at its next step.
@@ -188,7 +190,7 @@ def refuse_if_held(comm: MPI.Comm, directory: Path) -> None:
 
 
 def find_lock(directory: Path) -> FoundLock | None:
-    """The lock in a directory, or None; OSError if the file system fails."""
+    """Return the lock in a directory, or None; OSError if the file system fails."""
     path = directory / LOCK
     try:
         return FoundLock(_read(path), directory, path.stat().st_mtime)
@@ -243,7 +245,8 @@ def _write(path: Path, holder: Holder) -> None:
 
 
 def _now(directory: Path) -> float:
-    """Present time by the clock of the directory's file system, or of this machine if no file can be written there."""
+    """Return the present time by the clock of the directory's file system. If no file can be written there, the clock
+    of this machine is used."""
     try:
         with tempfile.TemporaryFile(dir=directory) as file:
             return os.fstat(file.fileno()).st_mtime
@@ -256,7 +259,7 @@ def _is_held_by(path: Path, holder: Holder) -> bool:
 
 
 def _read(path: Path) -> Holder:
-    """The job that a lock names; a job with the name UNREADABLE if the content is incomplete or cannot be read."""
+    """Return the job that a lock names. Its name is UNREADABLE if the content is incomplete or cannot be read."""
     try:
         return Holder(**json.loads(path.read_text()))
     except (FileNotFoundError, NotADirectoryError):
@@ -266,7 +269,8 @@ def _read(path: Path) -> Holder:
 
 
 def _machine() -> str:
-    """Boot id of this machine, and process namespace, which differs between containers; empty if unknown."""
+    """Return the boot id of this machine and the process namespace, which differs between containers; empty if they are
+    unknown."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip() + " " + os.readlink("/proc/self/ns/pid")
     except OSError:
@@ -274,7 +278,7 @@ def _machine() -> str:
 
 
 def _born(pid: int) -> str:
-    """Start time of a process of this machine; empty if the process has ended or the time is unknown."""
+    """Return the start time of a process of this machine; empty if the process has ended or the time is unknown."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:

@@ -1,11 +1,11 @@
-"""Particle tracks of experiments and other programs, read in four layouts and written in one.
+"""Particle tracks of experiments and other programs, read in four layouts and written in the first of them.
 
 A track is the path of one particle. Tracks are kept as rows, one for each particle and time, sorted by time. Layouts:
 
 - "h5md": H5MD 1.1 (de Buyl, Colberg & Höfling, Comput. Phys. Commun. 185, 1546), which eddies uses for trajectories.
   /particles/GROUP holds `position`, `velocity` and `id`. An id below 0 marks a row without a particle.
 - "npz": NumPy arrays `pos` and `vel` (frames, particles, 3) and `rho` (frames, particles), as published with Tian et
-  al. (2023), with the times in `time` (frames,) if the file has them.
+  al. (2023). The file may also have the times of the frames, `time` (frames,).
 - "lagrangebench": TRAJECTORY/position (frames, particles, 3) and metadata.json beside the file (Toshev et al. 2023).
 - "csv": a table with the columns track, time, x, y, z and optionally u, v, w, as tracking programs write it.
 """
@@ -61,7 +61,7 @@ class Tracks:
         return {name: values for name, values in found.items() if values is not None}
 
     def chosen(self, rows: np.ndarray) -> Tracks:
-        """The tracks with these rows only; `rows` holds row numbers or a boolean mask."""
+        """Return the tracks with these rows only; `rows` holds row numbers or a boolean mask."""
         return replace(self, **{name: values[rows] for name, values in self.columns.items()})
 
     @cached_property
@@ -107,7 +107,7 @@ def read_tracks(path: str | Path, layout: str | None = None, group: str | None =
 
 def write_tracks(path: str | Path, times: Any, ids: Any, positions: Any, velocities: Any = None,
                  edge: float = 2 * math.pi) -> None:
-    """Write tracks as an H5MD file that `read_tracks` and `[tracks]` read.
+    """Write tracks as an H5MD file, which `read_tracks` and the section [tracks] of a scene can read.
 
     Parameters
     ----------
@@ -147,7 +147,8 @@ def write_tracks(path: str | Path, times: Any, ids: Any, positions: Any, velocit
 
 
 def _layout_of(path: Path) -> str:
-    """The layout of a file by its suffix. An HDF5 file is "h5md" if it has /particles, else "lagrangebench"."""
+    """Return the layout that the suffix of a file shows. An HDF5 file has the layout "h5md" if it holds /particles,
+    else "lagrangebench"."""
     suffix = path.suffix.lower()
     if suffix in (".h5", ".hdf5", ".h5md"):
         with h5py.File(path) as file:
@@ -217,7 +218,8 @@ UNREADABLE = (KeyError, ValueError, TypeError, IndexError, AttributeError, EOFEr
 
 
 def _chosen(path: Path, holder: Mapping[str, Any], name: str | None, what: str) -> Any:
-    """The group with this name, or the only group if the name is None. ProductError if there is no such group."""
+    """Return the group `name` of `holder`, or its only group if `name` is None. Raises ProductError if there is no such
+    group; `what` says in the message what the groups are."""
     if name is None and len(holder) == 1:
         return next(iter(holder.values()))
     if name is not None and name in holder:
@@ -229,8 +231,9 @@ def _chosen(path: Path, holder: Mapping[str, Any], name: str | None, what: str) 
 def _from_frames(times: np.ndarray, position: np.ndarray, velocity: np.ndarray | None = None,
                  density: np.ndarray | None = None, edges: Sequence[float] = (),
                  ids: np.ndarray | None = None) -> Tracks:
-    """Tracks from arrays (frames, particles, ...) and `times` (frames,). Entries with an id below 0 are left out. `ids`
-    may be the same in all frames, or None: 0, 1, ... The box is a cube if `edges` holds one number."""
+    """Return tracks from arrays (frames, particles, ...) and `times` (frames,). Entries with an id below 0 are left
+    out. `ids` is (frames, particles), (particles,) for the same ids in all frames, or None for the ids 0, 1, ...
+    `edges` holds the different edges of the box; with a single one, the box is a cube."""
     if position.ndim != 3 or position.shape[2] != 3:
         raise ValueError(f"positions have the shape {position.shape}, not (frames, particles, 3)")
     ids = np.broadcast_to(np.arange(position.shape[1]) if ids is None else ids, position.shape[:2])
@@ -253,7 +256,8 @@ def _from_frames(times: np.ndarray, position: np.ndarray, velocity: np.ndarray |
 
 
 def checked(tracks: Tracks, path: Path) -> Tracks:
-    """The tracks sorted by time and id, with ids of 64 bits. ProductError if there is no row, or a row is not valid."""
+    """Return the tracks sorted by time and id, with ids of 64 bits. Raises ProductError if there is no row, or if a row
+    is not valid."""
     rows = len(tracks.time)
     if not rows:
         raise ProductError(f"{path}: holds no particles")

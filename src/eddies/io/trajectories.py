@@ -1,8 +1,8 @@
 """Particle trajectories in the H5MD 1.1 layout (de Buyl, Colberg & Höfling, Comput. Phys. Commun. 185, 1546).
 
-Row k of every frame belongs to the particle with id k, so frames can be compared without sorting. The box has edges for
-every frame. The attribute `unit` names molecular units (Angstrom, ps) in place of L, T and L/T, because readers such as
-MDAnalysis accept no others.
+Row k of every frame belongs to the particle with id k, so frames can be compared without sorting. The edges of the
+box are stored for every frame. The attribute `unit` names molecular units (Angstrom, ps) in place of L, T and L/T,
+because readers such as MDAnalysis accept no others.
 """
 
 from collections.abc import Mapping
@@ -112,7 +112,7 @@ class Trajectory:
         return self._group["step"][()]
 
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Rows start, ..., stop - 1 of a column at a frame, (stop - start, ...), in order of id.
+        """Return rows start, ..., stop - 1 of a column at a frame, (stop - start, ...), in order of id.
 
         Raises ProductError if ids are not in order, a position is outside the cube or, except in a rollout, a number
         is not finite.

@@ -1,8 +1,8 @@
 """VTKHDF files: a series of fields or of particles in one file that ParaView opens.
 
-Layout: "VTKHDF file format" in the documentation of VTK, version 2.0, which VTK 9.3 (ParaView 5.12) and later versions
-read. A file needs no other file. The reader fails on a time axis with one step. A single frame is therefore written
-without steps; its time is the field data `time`.
+The layout is version 2.0 of the "VTKHDF file format" in the documentation of VTK. VTK 9.3 (ParaView 5.12) and later
+versions read it. A file needs no other file. The reader fails on a time axis with one step. A single frame is therefore
+written without steps; its time is the field data `time`.
 """
 
 import math
@@ -74,7 +74,8 @@ def write_points(path: Path, trajectory: Trajectory, provenance: Mapping[str, An
 @contextmanager
 def _create(path: Path, kind: str, frames: int, layout: Layout,
             provenance: Mapping[str, Any]) -> Iterator[h5py.Group]:
-    """The group VTKHDF of a new file, with empty datasets."""
+    """Create a file and yield its group VTKHDF, which has the empty datasets of `layout`. `kind` is VTK's name for the
+    type of the data, and `frames` is their number."""
     within = {f"VTKHDF/{name}": dataset for name, dataset in layout.items()}
     with create_export(path, within, provenance, STEP_BYTES * frames) as file:
         root = file["VTKHDF"]
@@ -111,7 +112,8 @@ def _copy_field(series: FieldSeries, frame: int, variable: str, dataset: h5py.Da
 
 
 def _write_cells(root: h5py.Group, total: int) -> None:
-    """Write the number of points and of cells: a vertex at each point, and no lines, polygons and strips."""
+    """Write the numbers of points and of cells. Each of the `total` points has a vertex; there are no lines, polygons
+    or strips."""
     root["NumberOfPoints"] = np.array([total])
     for cells, count in (("Vertices", total), ("Lines", 0), ("Polygons", 0), ("Strips", 0)):
         root[f"{cells}/NumberOfCells"] = root[f"{cells}/NumberOfConnectivityIds"] = np.array([count])
@@ -120,7 +122,8 @@ def _write_cells(root: h5py.Group, total: int) -> None:
 
 
 def _point_offsets(frames: int, total: int, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """The offsets of the steps in each dataset. All steps share the ids and the cells, which are stored once."""
+    """Return the offsets of the steps in each dataset. The datasets `names` hold `total` rows for each step. All steps
+    share the ids and the cells, which are stored once."""
     shared = np.zeros(frames, np.int64)
     offsets = {"NumberOfParts": shared + 1, "PartOffsets": shared, "PointDataOffsets/id": shared}
     for name in ("CellOffsets", "ConnectivityIdOffsets"):
@@ -131,5 +134,5 @@ def _point_offsets(frames: int, total: int, names: Iterable[str]) -> dict[str, n
 
 
 def _offsets_of(name: str) -> str:
-    """The name of the dataset in the group Steps that holds the offsets of the dataset `name`."""
+    """Return the name under which the group Steps stores the offsets of the dataset `name`."""
     return "PointOffsets" if name == "Points" else name.replace("PointData/", "PointDataOffsets/")

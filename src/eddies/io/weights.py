@@ -15,7 +15,8 @@ from eddies.io.provenance import read_json, read_provenance
 
 @dataclass(frozen=True)
 class StoredWeights:
-    """The content of a file of trained weights: a description, tensors and tables by name, and its provenance."""
+    """The content of a file of trained weights: a description, the tensors and the tables, each by name, and the
+    provenance of the file."""
 
     path: Path
     description: dict[str, Any]
@@ -27,7 +28,8 @@ class StoredWeights:
 def save_weights(comm: MPI.Comm, path: str | Path, kind: str, description: Mapping[str, Any],
                  tensors: Mapping[str, np.ndarray], provenance: Mapping[str, Any],
                  tables: Mapping[str, Mapping[str, np.ndarray]] | None = None) -> None:
-    """Write rank 0's tensors, a JSON-able description and small tables as one product; collective.
+    """Write rank 0's tensors, a description and small tables as one product of this `kind`; collective. The description
+    must be possible to write as JSON.
 
     Raises ProductError on all ranks if the file cannot be written or a tensor is not finite.
     """

@@ -67,8 +67,9 @@ class _Copies:
 class ColumnCopies(_Copies):
     """Copies between modes, columns and blocks for transforms along z.
 
-    Modes have shape (c, kz, y, x). A column (z, rows, x) holds one component at some values of y, the rows, and may
-    have gaps between successive z. The ranks exchange blocks (c, z, y, x), which are successive parts along z.
+    Modes have shape (c, kz, y, x). A column (z, rows, x) holds one component at consecutive values of y, the `rows`. It
+    may have gaps in memory between successive z. The ranks exchange blocks (c, z, y, x), which are successive parts
+    along z.
     """
 
     exchanged_axis = 1
@@ -81,7 +82,7 @@ class ColumnCopies(_Copies):
         self._receive = self._function("receive_column", ADDRESS, *4 * [INT], ADDRESS)
 
     def fill(self, modes: Described, component: int, rows: slice, factors: Described | None, column: Described) -> None:
-        """Copy the modes of a component at some `rows` to a column. Factors (kz), if given, multiply the modes."""
+        """Copy the modes of a component at some `rows` to a column. Factors (kz,), if given, multiply the modes."""
         sizes, start = self._sizes(modes, component, rows, column)
         self._fill(*sizes, start, None if factors is None else factors.address, column.address)
 
@@ -91,15 +92,15 @@ class ColumnCopies(_Copies):
         self._store(*sizes, column.address, scale, start)
 
     def send(self, column: Described, blocks: Blocks, component: int, rows: slice) -> None:
-        """Copy a column to a component of the blocks, at some `rows`."""
+        """Copy a column, part by part along z, to a component of all blocks at some `rows`."""
         self._exchange(self._send, column, blocks, component, rows)
 
     def receive(self, blocks: Blocks, component: int, rows: slice, column: Described) -> None:
-        """Copy a component of the blocks, at some `rows`, to a column."""
+        """Copy a component of all blocks at some `rows` to a column. The blocks become its successive parts along z."""
         self._exchange(self._receive, column, blocks, component, rows)
 
     def _sizes(self, modes: Described, component: int, rows: slice, column: Described) -> tuple[tuple[int, ...], int]:
-        """Sizes for the library, and the address of the rows in the modes."""
+        """Return sizes for the library, and the address of the rows in the modes."""
         _, _, lines, width = modes.shape
         start = modes.address + component * modes.strides[0] + rows.start * modes.strides[2]
         return (self._cutoff, self._cells, lines * width, column.shape[1] * width, column.apart), start
@@ -115,8 +116,8 @@ class PlaneCopies(_Copies):
     The ranks exchange blocks (c, planes, y, x) of the modes with kx >= 0, which are successive parts along y. Two real
     planes f and g are transformed as one complex plane f + i g. Of the planes that are transformed together, f is in
     the first half, and g has the same place in the second half. The packed modes (c, pairs, ky, kx) of f + i g hold
-    kx = 0 ... K, -K ... -1. The number of planes is even, or one: a single plane is its own partner. Because of
-    round-off, a mode with kx = 0 may differ from the conjugate of its mirror image. The mean of both is then taken.
+    kx = 0 ... K, -K ... -1. The number of planes is even, or one; with one plane, f and g are the same plane. Because
+    of round-off, a mode with kx = 0 may differ from the conjugate of its mirror image. The mean of both is then taken.
     """
 
     exchanged_axis = 2
@@ -129,7 +130,7 @@ class PlaneCopies(_Copies):
         self._split, self._join = (self._function(name, INT, *3 * [ADDRESS]) for name in ("split", "join"))
 
     def pack(self, blocks: Blocks, planes: slice) -> np.ndarray:
-        """Packed modes of some planes."""
+        """Return the packed modes of some planes."""
         components, count = blocks.shape[0], planes.stop - planes.start
         packed = np.empty((components, (count + 1) // 2, self._kept, self._kept), self._dtype)
         self._pack(ctypes.byref(blocks), components, planes.start, count, _address(packed))
@@ -169,7 +170,8 @@ class PlaneCopies(_Copies):
         self._join(points, f, g, place)
 
     def _halves(self, complex_planes: Described, real: Described, component: int, planes: slice) -> tuple[int, ...]:
-        """Number of points; addresses of the complex planes and of the first and second half of the real planes."""
+        """Return the number of points, and the addresses of the complex planes and of the first and the second half of
+        the real planes."""
         count, (pairs, y, x) = planes.stop - planes.start, complex_planes.shape
         f = real.address + component * real.strides[0] + planes.start * real.strides[1]
         return pairs * y * x, complex_planes.address, f, f + (count - pairs) * real.strides[1]

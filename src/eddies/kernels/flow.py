@@ -43,30 +43,32 @@ class Formulas:
     def advection(self, fields: np.ndarray, viscosity: float, out: np.ndarray) -> None:
         """Write -u.grad u + 2 nu (S - 1/3 div u).grad s and -u.grad s to `out` (4, ...).
 
-        `fields` (15, ...) holds the vector u, then the derivatives of (u, v, w, s) along x, along y and along z.
+        u is the velocity, S the rate of strain, s the logarithm of the density and nu the `viscosity`. `fields` (15,
+        ...) holds the vector u, then the derivatives of (u, v, w, s) along x, along y and along z.
         """
         size = fields[0].size
         self._advection(size, *self._place(fields, 15, size), viscosity, *self._place(out, 4, size))
 
     def cross(self, fields: np.ndarray, out: np.ndarray) -> None:
-        """Write u x omega to `out` (3, ...); fields (6, ...): u, then omega."""
+        """Write u x omega to `out` (3, ...). `fields` (6, ...) holds the velocity u, then the vorticity omega."""
         size = fields[0].size
         self._cross(size, *self._place(fields, 6, size), *self._place(out, 3, size))
 
     def project(self, vector: np.ndarray) -> np.ndarray:
-        """u - k (k.u) / k^2 of modes u (3, kz, ky, kx)."""
+        """Return u - k (k.u) / k^2, where u are the modes `vector` (3, kz, ky, kx)."""
         require(vector, (3, *self._shape), self._complex)
         result = np.empty_like(vector)
         self._project(ctypes.byref(self._modes), address(vector), address(result))
         return result
 
     def sum_of_decays(self, terms: Terms) -> np.ndarray:
-        """Sum of factors (n = 1) times states (c, kz, ky, kx)."""
+        """Return the sum of factors (n = 1) times states (c, kz, ky, kx)."""
         components = len(terms[0][1])
         return self._sum(self._decays, [components], components, 1, terms)
 
     def sum_of_acoustic_blocks(self, terms: Terms) -> np.ndarray:
-        """Sum of states (4, kz, ky, kx), each mapped with its factors (n = 5) by `add_acoustic_block` in flow.cpp."""
+        """Return the sum of states (4, kz, ky, kx). Before the sum, `add_acoustic_block` in flow.cpp maps each state
+        with its factors (n = 5)."""
         return self._sum(self._acoustic_blocks, [], 4, 5, terms)
 
     def _sum(self, function: Callable[..., None], counts: list[int], components: int, factors: int,

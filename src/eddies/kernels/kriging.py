@@ -26,15 +26,15 @@ class _Sums(ctypes.Structure):
 
 def kriging_weights(offsets: np.ndarray, displacement: np.ndarray, support: float, noise: float, slowest: float,
                     amplitudes: np.ndarray, sited: bool = True) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Weights of n receivers' own values, (10, n), and of their neighbours' values, ten arrays (m,) for m pairs.
+    """Return the weights of n receivers' own values, (10, n), and of their neighbours' values, ten arrays (m,).
 
-    `eddies.particles.kriging.kriging_weights` defines them. The ten arrays are separate so that each is small enough
-    for the allocator to keep its memory when it is freed.
+    There are m pairs. `eddies.particles.kriging.kriging_weights` defines the weights. The ten arrays are separate so
+    that each is small enough for the allocator to keep its memory when it is freed.
 
     Parameters
     ----------
     offsets : int64 (n + 1,), first pair of each receiver and, at the end, the number of pairs.
-    displacement : (3, m), x_i - x_j, contiguous, in single or double precision.
+    displacement : (3, m), x_i - x_j from neighbour j to receiver i, contiguous, in single or double precision.
     support : distance beyond which a receiver has no neighbours.
     noise : variance of the part of a value that does not belong to the field.
     slowest, amplitudes : parameters of the covariance sum_k amplitudes[k] exp(-slowest 2^k r^2), at most eight terms.
@@ -53,7 +53,7 @@ def kriging_weights(offsets: np.ndarray, displacement: np.ndarray, support: floa
 
 def weighted_sums(offsets: np.ndarray, senders: np.ndarray, own: Sequence[np.ndarray] | None,
                   weights: Sequence[np.ndarray], field: np.ndarray) -> np.ndarray:
-    """own_i f_i + sum_j weights_ij f_j, (n, c, rows), for one, three, four or ten rows of weights.
+    """Return own_i f_i + sum_j weights_ij f_j, (n, c, rows), for one, three, four or ten rows of weights.
 
     `offsets` (n + 1,) is as in `kriging_weights`, and `senders` (m,) has the sender of each pair; both are int64. `own`
     has rows (n,), or is None if receivers are not particles; `weights` has rows (m,). `field` (s, c) begins

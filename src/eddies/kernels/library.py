@@ -30,12 +30,12 @@ class MissingLibraryError(UserError):
 
 @functools.cache
 def library() -> ctypes.CDLL:
-    """The library for this processor. Raises MissingLibraryError."""
+    """Return the library for this processor. Raises MissingLibraryError."""
     return load(in_use())
 
 
 def instruction_sets() -> list[str]:
-    """The instruction sets that the library was built for and this processor runs, the best one last."""
+    """Return the instruction sets that the library was built for and that this processor runs, the best one last."""
     built = [name for name in INSTRUCTION_SETS if _path(name).exists()]
     if "plain" not in built:
         return []
@@ -44,7 +44,7 @@ def instruction_sets() -> list[str]:
 
 
 def in_use() -> str:
-    """The instruction set of the library that this process uses. Raises MissingLibraryError."""
+    """Return the instruction set of the library that this process uses. Raises MissingLibraryError."""
     available = instruction_sets()
     if not available:
         raise MissingLibraryError(f"no compiled kernels in {_path('plain').parent}: {REMEDY}")
@@ -53,10 +53,10 @@ def in_use() -> str:
 
 @functools.cache
 def load(instruction_set: str) -> ctypes.CDLL:
-    """The library for one instruction set.
+    """Return the library for one instruction set.
 
-    Raises MissingLibraryError if it does not load, or if it was not built from the sources beside it: its
-    functions may then take other arguments.
+    Raises MissingLibraryError if it does not load, or if it was not built from the sources beside it. In the second
+    case its functions may take other arguments.
     """
     share_threads()
     try:
@@ -78,8 +78,8 @@ def load(instruction_set: str) -> ctypes.CDLL:
 def share_threads() -> None:
     """Make kernels, and torch if it is loaded later, use the OpenMP runtime of pyfftw's wheel.
 
-    Otherwise the threads of two runtimes wait for each other and spin on the same cores: a step of the direct
-    simulation took twenty times as long.
+    Otherwise the threads of two runtimes wait for each other on the same cores; a step of the direct simulation then
+    took twenty times as long.
     """
     maps = Path("/proc/self/maps")
     if threads() == 1 or not maps.exists():
@@ -107,12 +107,13 @@ def keep_freed_memory() -> None:
 
 
 def members(kind: type, names: str) -> list[tuple[str, type]]:
-    """Members of a ctypes structure that have one type; `names` are separated by spaces."""
+    """Return members of a ctypes structure that have one type; `names` are separated by spaces."""
     return [(name, kind) for name in names.split()]
 
 
 def address(array: np.ndarray) -> int:
-    """Address of the first element. The caller keeps the array alive until the call of the library has ended."""
+    """Return the address of the first element. The caller keeps the array alive until the call of the library has
+    ended."""
     return array.ctypes.data
 
 

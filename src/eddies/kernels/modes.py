@@ -1,4 +1,4 @@
-"""Passes over the modes of a vector field, for conjugate gradients on solenoidal modes."""
+"""Loops over the modes of a vector field, for the method of conjugate gradients on solenoidal modes."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class _Weights(ctypes.Structure):
 
 
 class ModePasses:
-    """The operations of one iteration on modes (3, kz, ky, kx).
+    """The operations of one iteration of conjugate gradients on modes (3, kz, ky, kx).
 
-    Inner products of real fields are sums over the modes of this rank, each counted by its `multiplicity`.
+    The inner product <a, b> of real fields is a sum over the modes of this rank. Each mode counts `multiplicity` times.
 
     Parameters
     ----------
@@ -39,21 +39,24 @@ class ModePasses:
         self._weights = _Weights(z, y, x, *map(address, self._arrays))
 
     def apply(self, given: np.ndarray, modes: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return I = P (scale * given) + penalty * modes and <I, modes>. P projects on solenoidal modes."""
+        """Return two results: I = P (scale * given) + penalty * modes, and <I, modes>. P projects on solenoidal
+        modes."""
         applied = np.empty_like(modes)
         return applied, self._call("modes_image", ctypes.c_double, [], [given, modes, applied])
 
     def descend(self, length: float, inverse: np.ndarray, direction: np.ndarray, applied: np.ndarray,
                 solution: np.ndarray, residual: np.ndarray) -> float:
-        """solution += length * direction, residual -= length * applied; returns <residual, inverse * residual>."""
+        """Add length * direction to `solution` and subtract length * applied from `residual`, both in place. Return
+        <residual, inverse * residual> of the new residual."""
         return self._call("modes_descend", ctypes.c_double, [length, inverse], [direction, applied, solution, residual])
 
     def update_direction(self, beta: float, inverse: np.ndarray, residual: np.ndarray, direction: np.ndarray) -> None:
-        """direction = inverse * residual + beta * direction."""
+        """Replace `direction` by inverse * residual + beta * direction, in place."""
         self._call("modes_turn", None, [beta, inverse], [residual, direction])
 
     def _call(self, name: str, result: type | None, given: list, vectors: list[np.ndarray]) -> float:
-        """Call a function with vectors, and with `given`: empty, or a number and an array (kz, ky, kx)."""
+        """Call a function of the library with `vectors` and with `given`, which is empty or holds a number and an array
+        (kz, ky, kx)."""
         for array in given[1:]:
             require(array, self._shape, self._kind)
         for vector in vectors:

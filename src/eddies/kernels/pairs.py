@@ -77,7 +77,8 @@ class CompiledPairs:
             space.length_unit, space.velocity_unit, space.mutual)
 
     def sums(self, summands: Sequence[Summand], parameters: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """A list of the sums (components, n) of each summand with its parameters, valid only at the wanted particles.
+        """Return for each summand, with its parameters, the sums (components, n). They are valid only at the wanted
+        particles.
 
         Raises ValueError if a position is not finite or the library has no such summand.
         """

@@ -23,7 +23,7 @@ class _Fit(ctypes.Structure):
 
 
 def kernel_numbers(support: float, pieces: np.ndarray, signed: bool = False) -> tuple[float, ...]:
-    """A smoothing kernel W as numbers for the library.
+    """Return a smoothing kernel W as numbers for the library.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def kernel_numbers(support: float, pieces: np.ndarray, signed: bool = False) -> 
 
 def sums_on_grid(box: Box, cells: int, planes: range, numbers: tuple[float, ...], position: np.ndarray,
                  columns: np.ndarray) -> np.ndarray:
-    """Sums over the particles, sum_j c_j W(x - x_j), at the points x of a grid: (points, 4).
+    """Return the sums over the particles, sum_j c_j W(x - x_j), at the points x of a grid, (points, 4).
 
     `position` (n, 3) holds the x_j, and `columns` (n, 4) holds the c_j. The points are those in the consecutive
     `planes` of a grid of `cells`^3 points. `numbers` is the kernel W in the form that `kernel_numbers` returns. The
@@ -54,12 +54,13 @@ def sums_on_grid(box: Box, cells: int, planes: range, numbers: tuple[float, ...]
 
 def fitted(box: Box, degree: int, numbers: tuple[float, ...], volume: float, ridge: float, offsets: np.ndarray,
            senders: np.ndarray, receivers: np.ndarray, positions: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Moving least squares fit of a vector at each receiver, (n, 4, 3): the vector, then its x, y and z derivatives.
+    """Fit a vector at each receiver by moving least squares. Return (n, 4, 3): the vector, then its derivatives along
+    x, y and z.
 
     `eddies.particles.particle_field.ParticleField.fitted` defines the fit. `numbers` is the weight W in the form that
     `kernel_numbers` returns. `volume` is the mean volume of a particle. `offsets` (n + 1,) and `senders` (m,) list the
-    particles near each receiver; some may lie outside the support. `positions` and `values` are (s, 3), `receivers`
-    (n, 3).
+    particles near each receiver; some of these particles may lie outside the support of W. `positions` and `values` of
+    the particles are (s, 3), the positions `receivers` are (n, 3).
     """
     kernel = np.array(numbers)
     offsets, senders = (np.ascontiguousarray(rows, np.int64) for rows in (offsets, senders))

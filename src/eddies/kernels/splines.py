@@ -14,7 +14,7 @@ PADDING = 8
 
 
 class MisplacedPoint(ValueError):
-    """A point is not finite, or its splines reach beyond the planes; `number` is the index of the first such point."""
+    """A point is not finite, or its splines reach beyond the planes. `number` is the index of the first such point."""
 
     def __init__(self, number: int) -> None:
         super().__init__(f"point {number} has no place among the planes")
@@ -48,13 +48,15 @@ class Splines:
             raise MisplacedPoint(misplaced)
 
     def at(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """Values (n, c) at the points, float64, from planes of coefficients; summed in the precision of the planes."""
+        """Return the values (n, c) at the points, as float64, from planes of coefficients. They are summed in the
+        precision of the planes."""
         values = np.empty((self._cloud.points, len(parts[0])))
         self._call("splines_at", _contiguous(parts), values)
         return values
 
     def slope(self, parts: Sequence[np.ndarray], factors: np.ndarray) -> np.ndarray:
-        """Spatial gradient (n, 3) of sum_c factors_c f_c, with interpolated fields f_c and fixed `factors` (n, c)."""
+        """Return, at each point, the spatial gradient of sum_c factors_c f_c, (n, 3). f_c are the interpolated fields;
+        the `factors` (n, c) of a point are constant in space."""
         gradients = np.empty((self._cloud.points, 3))
         self._call("splines_slope", _contiguous(parts), np.ascontiguousarray(factors, np.float64), gradients)
         return gradients / self._spacing

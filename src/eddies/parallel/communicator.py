@@ -42,7 +42,7 @@ def warn_of_few_processors(comm: Comm) -> None:
 
 @contextlib.contextmanager
 def _node(comm: Comm) -> Iterator[Comm]:
-    """Communicator of the ranks that share memory with this one."""
+    """Yield the communicator of the ranks that share memory with this one."""
     node = comm.Split_type(MPI.COMM_TYPE_SHARED)
     yield node
     node.Free()

@@ -14,12 +14,12 @@ class HaloError(UserError, ValueError):
 
 
 class HaloExchange:
-    """Exchange of ghosts: the neighbouring ranks' particles within `width` of this slab. One plan serves all columns.
+    """Exchange of ghosts: the neighbouring ranks' particles within `width` of this slab. Any column can be exchanged.
 
     Parameters
     ----------
     decomposition : the slabs of all ranks.
-    positions : (n, 3), owned particles with z within this rank's slab.
+    positions : (n, 3), the positions of this rank's own particles, whose z lies in this rank's slab.
     width : a rank needs the particles up to this distance beyond the faces of its slab.
 
     Each rank sends the particles near its lower face down and those near its upper face up. The two exchanges stay
@@ -60,11 +60,12 @@ class HaloExchange:
         return ghosts
 
     def adjoint(self, ghosts: np.ndarray) -> np.ndarray:
-        """Apply the transpose of `forward`: return for each owned row the sum of its ghost rows, (n, ...)."""
+        """Apply the transpose of `forward` to `ghosts` (count, ...). Return for each owned row the sum of its ghost
+        rows on all ranks, (n, ...)."""
         ghosts = np.asarray(ghosts)
         slab, tail = self.decomposition, ghosts.shape[1:]
         owned = np.zeros((self.owned, *tail), ghosts.dtype)
-        # An owned row occurs at most once per face: indexed addition would leave out repeated rows.
+        # An owned row occurs at most once in each list. Otherwise indexed addition would leave out repeated rows.
         owned[self._down] += _exchange(slab, ghosts[: self._from_above], slab.above, slab.below,
                                        (len(self._down), *tail))
         owned[self._up] += _exchange(slab, ghosts[self._from_above :], slab.below, slab.above, (len(self._up), *tail))
@@ -74,8 +75,8 @@ class HaloExchange:
 class PlaneHalo:
     """Ghost planes of the neighbouring slabs: `below` planes under this rank's planes, and `above` planes over them.
 
-    Neighbours are periodic. With a single rank its own planes are the ghosts, and no message is sent. Raises HaloError
-    if a slab has fewer planes than `below` or `above`.
+    The slabs are periodic: the first and the last one are neighbours. With a single rank its own planes are the ghosts,
+    and no message is sent. Raises HaloError if a slab has fewer planes than `below` or `above`.
     """
 
     def __init__(self, decomposition: SlabDecomposition, below: int, above: int) -> None:
@@ -102,7 +103,8 @@ class PlaneHalo:
         return [below, planes, above]
 
     def adjoint(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """Apply the transpose of `forward`: add ghost planes in place to their owners' planes (c, z_local, ...)."""
+        """Apply the transpose of `forward` to arrays that `parts` has made. Add the ghost planes to the planes
+        (c, z_local, ...) of their owners in place, and return this rank's planes."""
         highest, planes, lowest = parts
         slab, count = self.decomposition, planes.shape[1]
         if slab.size > 1:

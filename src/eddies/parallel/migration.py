@@ -14,10 +14,10 @@ class ParticleLossError(RuntimeError):
 
 
 class Redistribution:
-    """Sends each row to a given rank; planned once, applied to any column.
+    """Sends each row of a column to a given rank. One object serves all columns of the same particles.
 
-    `destination` (n,) is the rank that each row goes to. Received rows are sorted by
-    source rank, and rows from one rank keep their order. With a single rank no message is sent.
+    `destination` (n,) is the rank that each row goes to. Received rows are sorted by the rank that sent them, and rows
+    from one rank keep their order. With a single rank no message is sent.
     """
 
     def __init__(self, comm: MPI.Comm, destination: np.ndarray) -> None:

@@ -17,8 +17,8 @@ def block_starts(total: int, parts: int) -> np.ndarray:
 class SlabDecomposition:
     """Slabs of a periodic cube of side `length`, cut along z into blocks of `planes` equal layers.
 
-    A particle and the grid planes around it are on the same rank. This rank owns the `count`
-    planes start, ..., stop - 1, between `lower` and `upper` in z. `below` and `above` are the neighbouring ranks.
+    A particle is on the rank that owns the grid plane just below it. This rank owns the `count` planes start, ...,
+    stop - 1, and the particles with z from `lower` to `upper`. `below` and `above` are the neighbouring ranks.
     """
 
     def __init__(self, comm: MPI.Comm, length: float, planes: int) -> None:
