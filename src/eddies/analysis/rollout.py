@@ -1,4 +1,4 @@
-"""A rollout and the true particles: frames of both, and quantities that are measured in the same way on both."""
+"""A rollout and the true particles: frames of both, and quantities that are measured in the same way in both."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -12,7 +12,8 @@ from eddies.analysis.velocity_gradients import Invariants
 
 SHOWN = 3   # largest number of times at which a report shows spectra of a rollout
 PLANES = 4  # largest number of times at which a report shows planes of a rollout
-Table = Mapping[str, np.ndarray]  # columns by name; spectra have wavenumber (shells,), time (m,), energy (m, shells)
+# Columns by name. A table of spectra has wavenumber (shells,), time (m,), energy (m, shells).
+Table = Mapping[str, np.ndarray]
 
 
 class Frames(Protocol):
@@ -24,12 +25,12 @@ class Frames(Protocol):
     length: float
 
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Rows start, ..., stop - 1 of one column of one frame, in order of id."""
+        """Return the rows start, ..., stop - 1 of a column in a frame. Rows are particles in order of id."""
 
 
 @dataclass(frozen=True)
 class CommonFrames:
-    """Frames of model and truth at the same times: frame numbers of both, and the times, each (m,)."""
+    """Frames of model and truth at the same times: the frame numbers of both, and these times, each (m,)."""
 
     model: np.ndarray
     truth: np.ndarray
@@ -46,7 +47,7 @@ class CommonFrames:
         return cls(rows, columns, model.times[rows])
 
     def spread(self, count: int) -> np.ndarray:
-        """Indices of at most `count` common frames, evenly spread from the first to the last."""
+        """Return the indices of at most `count` common frames, evenly spread from the first to the last."""
         return _spread(np.arange(self.times.size), count)
 
 
@@ -61,7 +62,10 @@ class Pair:
 
 @dataclass(frozen=True)
 class Plane:
-    """Velocity (3, n, n) and vorticity magnitude (n, n) in the plane z = pi, from particles; last axes: y, x."""
+    """Velocity (3, n, n) and vorticity magnitude (n, n) in the plane z = pi, reconstructed from particles.
+
+    The last two axes are y, x.
+    """
 
     velocity: np.ndarray
     vorticity: np.ndarray
@@ -71,7 +75,7 @@ class Plane:
 class SpectraAt:
     """Energy spectra (shells,) at one time, k = 0, 1, ...
 
-    `model` and `truth` come from the velocities of the particles, `filtered` from the filtered flow.
+    `model` and `truth` come from the velocities of the particles. `filtered` is the spectrum of the filtered flow.
     """
 
     time: float
@@ -84,32 +88,39 @@ class SpectraAt:
         return np.arange(len(self.model))
 
     def error(self, of: str, filter_wavenumber: float) -> float:
-        """`spectrum_error` of the model or the truth (`of`) relative to the filtered flow, up to a wavenumber."""
+        """Return the `spectrum_error` of a spectrum relative to the filtered flow, up to `filter_wavenumber`.
+
+        `of` names the spectrum: "model" or "truth".
+        """
         return spectrum_error(getattr(self, of), self.filtered, filter_wavenumber)
 
     def bands(self, of: str, filter_wavenumber: float) -> dict[str, float]:
-        """`band_ratios` of the model or the truth (`of`) to the filtered flow, up to a wavenumber."""
+        """Return the `band_ratios` of a spectrum to that of the filtered flow, up to `filter_wavenumber`.
+
+        `of` names the spectrum: "model" or "truth".
+        """
         return band_ratios(getattr(self, of), self.filtered, filter_wavenumber)
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """A rollout, the true particles, and measures of both for single frames.
+    """A rollout and the true particles, with measures of both in single frames.
 
     Parameters
     ----------
     attributes : attributes of the group `rollout` in rollout.h5.
     model, truth : particles, at times since the start of the rollout. The truth may end before the model. Without a
         ground truth, `truth` has no frames, and `without_truth` gives the reason.
-    flow : table `spectra` of the ground truth, with `energy` and `filtered`. Its times and `start_time` count from the
-        release of the tracers.
-    reference : scales of the ground truth.
-    spectra : for "model" and "truth", the energy (shells,) by frame, from a least-squares fit of modes to velocities.
-    invariants : for "model" and "truth", the invariants of velocity gradients at the particles, by frame. None
-        without a kernel, which reconstructs the gradients.
-    planes : for "model" and "truth", a plane of the reconstructed field, by frame. None without a kernel.
-    outside_training : share of particle pairs with a network input outside its range in training, (frames,); None if
-        it was not counted.
+    flow : table `spectra` of the ground truth, with the columns `energy` of the flow and `filtered` of the filtered
+        flow. Its times count from the release of the tracers.
+    reference : scales of the ground truth, by name.
+    spectra : for "model" and "truth", the energy spectrum (shells,) by frame number. It comes from a least-squares fit
+        of modes to the velocities of the particles.
+    invariants : for "model" and "truth", the invariants of the velocity gradients at the particles, by frame number.
+        None without a kernel, because the kernel reconstructs the gradients.
+    planes : for "model" and "truth", a plane of the reconstructed field, by frame number. None without a kernel.
+    outside_training : share of the particle pairs for which an input of a network is outside its range in training,
+        (frames,); None if it was not counted.
     closure : columns (frames,) `solves`, `iterations`, `most_iterations`, `residual` and `not_converged` of the
         iterative solves for the resolved velocity; None if there were no solves.
     reconstructed_by : name of the reconstruction method, for captions.
@@ -149,7 +160,7 @@ class Rollout:
 
     @property
     def filter_wavenumber(self) -> float:
-        """k_d = pi / d."""
+        """Wavenumber k_d = pi / d of the filter of width d."""
         return np.pi / self.filter_width
 
     @property
@@ -159,7 +170,7 @@ class Rollout:
 
     @property
     def powers(self) -> tuple[float, float]:
-        """Power per mass of the forcing: in the model, and in the true flow."""
+        """Power per mass of the forcing in the model, and that in the true flow."""
         model, truth = (float(self.attributes.get(name, 0.0)) for name in ("injection_rate", "truth_injection_rate"))
         return model, truth
 
@@ -184,17 +195,17 @@ class Rollout:
         return CommonFrames.of(self.model, self.truth, self.broken)
 
     def before_broken(self, of: str) -> np.ndarray:
-        """Frame numbers of "model" or "truth" before the time `broken` of the model."""
+        """Return the frame numbers before the time `broken`. `of` is "model" or "truth"."""
         return np.flatnonzero(getattr(self, of).times < self.broken)
 
     def pair(self, index: int, column: str) -> Pair:
-        """A column of model and truth at a common frame, rows in order of id."""
+        """Return a column of model and truth at the common frame `index`. Rows are particles in order of id."""
         common = self.common
         return Pair(float(common.times[index]), self.model.read(int(common.model[index]), column),
                     self.truth.read(int(common.truth[index]), column))
 
     def both(self, measures: Mapping[str, Mapping[int, Any]], index: int) -> tuple[Any, Any]:
-        """The model's and the truth's value in `measures`, such as `spectra`, at the common frame `index`."""
+        """Return the values of model and truth at the common frame `index`; `measures` is, for example, `spectra`."""
         return measures["model"][int(self.common.model[index])], measures["truth"][int(self.common.truth[index])]
 
     @property
@@ -204,18 +215,22 @@ class Rollout:
         return frames[self.model.times[frames] >= self.model.times[frames[-1]] / 2]
 
     def spectral(self) -> np.ndarray:
-        """Indices of the common frames at which the spectrum of the flow is stored."""
+        """Return the indices of the common frames at whose times the spectrum of the flow is stored."""
         return np.flatnonzero(self._has_flow(self.common.times))
 
     def shown_spectra(self, several: bool = True) -> np.ndarray:
-        """At most SHOWN frames of `spectral`, evenly spread. If `several` is False, only the last one."""
+        """Return at most SHOWN of the indices that `spectral` returns, evenly spread.
+
+        If `several` is false, return only the last one.
+        """
         return _spread(self.spectral(), SHOWN) if several else self.spectral()[-1:]
 
     def late_spectra(self) -> np.ndarray:
-        """Frame numbers of the model over which its spectrum is averaged, in the second half of the time to `broken`.
+        """Return the frame numbers over which the spectrum of the model is averaged.
 
-        A frame is used if the spectrum of the flow is stored at its time, or if the truth has no frame at this time.
-        If the second half has no such frame, the last such frame of the first half is used.
+        They are in the second half of the time before `broken`. A frame is used if the spectrum of the flow is stored
+        at its time, or if the truth has no frame at this time. If the second half has no such frame, the last such
+        frame of the first half is used.
         """
         times = self.model.times
         chosen = self._has_flow(times) | ~_contained(times, self.truth.times)
@@ -223,7 +238,7 @@ class Rollout:
         return frames[second_half(times[frames], float(times[self.before_broken("model")[-1]]))]
 
     def spectra_at(self, index: int) -> SpectraAt:
-        """Spectra at a common frame, in the shells that all three spectra have.
+        """Return the spectra at the common frame `index`, in the shells that all three spectra have.
 
         The spectrum of the filtered flow is the one at the nearest stored time.
         """
@@ -239,16 +254,19 @@ class Rollout:
 
 
 def second_half(times: np.ndarray, end: float) -> np.ndarray:
-    """Rows of the increasing `times` within [end / 2, end]; if there are none, the last row before `end`, or row 0."""
+    """Return the rows of the increasing `times` that are within [end / 2, end].
+
+    If there are none, return the last row before `end`, or row 0.
+    """
     rows = np.flatnonzero((times >= end / 2) & (times <= end * (1 + 1e-9)))
     return rows if rows.size else np.array([max(int(np.searchsorted(times, end, "right")) - 1, 0)])
 
 
 def _spread(values: np.ndarray, count: int) -> np.ndarray:
-    """At most `count` of values (m,), evenly spread from the first to the last."""
+    """Return at most `count` of the values (m,), evenly spread from the first to the last."""
     return values[np.unique(np.rint(np.linspace(0, len(values) - 1, count)).astype(int))]
 
 
 def _contained(times: np.ndarray, among: np.ndarray) -> np.ndarray:
-    """Whether each of `times` (m,) is equal, to 1e-6, to one of `among` (l,)."""
+    """Return, for each of `times` (m,), whether it is equal to one of the times `among` (l,), to within 1e-6."""
     return (np.abs(times[:, None] - among[None, :]) < 1e-6).any(axis=1)

@@ -1,6 +1,7 @@
 """Statistics of the tracers of a ground truth: energy, acceleration, Lagrangian structure function, pair dispersion.
 
-Tracers follow the filtered flow. So the filtered eddies set the accelerations and the small-scale separations.
+Unless the tracers follow the whole flow, only the eddies that pass the filter determine their accelerations and small
+separations.
 """
 
 from collections.abc import Mapping
@@ -13,17 +14,18 @@ from eddies.analysis.pdfs import bin_edges, pdf
 from eddies.analysis.rollout import Frames
 
 FOLLOWED = 2**14  # largest number of tracers whose velocities at all times are in memory at once
-CENTRES = 1000  # tracers around which pairs are searched
-PAIRS, FEWEST = 10_000, 30  # largest and smallest number of pairs at a distance
+CENTRES = 1000  # number of tracers around which pairs are searched
+PAIRS, FEWEST = 10_000, 30  # largest and smallest number of pairs at a distance; with fewer, the distance is left out
 SEPARATIONS, TOLERANCE = (0.5, 1.0, 2.0, 4.0), 0.1  # initial distances of pairs in mean spacings; relative tolerance
 EDGES = bin_edges(12, 120)  # bins of the PDF of accelerations, in standard deviations
 
 
 @dataclass(frozen=True)
 class Dispersion:
-    """Means over the tracer pairs with the initial distance `distance`.
+    """Means over the pairs of tracers that start at the distance `distance` from each other.
 
-    `spread` is <|r(t) - r(0)|^2>, (frames,). `structure` is <|v_1 - v_2|^2> at the start.
+    `spread` is <|r(t) - r(0)|^2> of the separation r of a pair, (frames,). `structure` is <|v_1 - v_2|^2> at the start,
+    with the velocities v_1 and v_2 of a pair.
     """
 
     distance: float
@@ -37,13 +39,15 @@ class TracerStatistics:
 
     Parameters
     ----------
+    times, field_times : times of the frames since the first, (frames,), and of the stored fields, (fields,).
     energy_ratio : <v.v> of the tracers divided by <v.v> of the filtered field, at `field_times`, (fields,).
     energy_error : standard deviation of this ratio for the same number of random points, (fields,).
     probability : PDF of an acceleration component divided by its rms at the same time, in the bins EDGES, (bins,).
         Accelerations are velocity differences of successive frames.
     kurtosis : kurtosis of this PDF; 3 if it is Gaussian.
     acceleration_rms : rms of an acceleration component over the first interval.
-    structure : Lagrangian structure function at the time lags `lags`.
+    structure : Lagrangian structure function of a velocity component at the time lags `lags`.
+    dispersion : pair dispersion for each initial distance.
     """
 
     times: np.ndarray
@@ -59,31 +63,41 @@ class TracerStatistics:
 
     @property
     def structure_exponent(self) -> float:
-        """Exponent of the structure function between the first two lags: 2 if accelerations are resolved."""
+        """Exponent of the structure function between the first two lags. It is 2 if the accelerations are resolved."""
         return first_exponent(self.lags, self.structure)
 
     @property
     def ballistic_exponent(self) -> float:
-        """Exponent of pair dispersion at the first two times after the start, mean over distances; 2 if ballistic."""
+        """Exponent of the pair dispersion between the first two times after the start, averaged over distances.
+
+        It is 2 if each pair keeps its initial velocities (ballistic motion).
+        """
         exponents = [first_exponent(self.times[1:], pairs.spread[1:]) for pairs in self.dispersion]
         return float(np.mean(exponents)) if exponents else np.nan
 
     @property
     def ballistic_prefactor(self) -> float:
-        """<|r - r0|^2> / (<|v_1 - v_2|^2> t^2) at the first time after the start, mean over distances; ballistic: 1."""
+        """<|r - r0|^2> / (<|v_1 - v_2|^2> t^2) at the first time t after the start, averaged over distances.
+
+        It is 1 for ballistic motion.
+        """
         ratios = [pairs.spread[1] / (pairs.structure * self.times[1] ** 2) for pairs in self.dispersion]
         return float(np.mean(ratios)) if ratios else np.nan
 
 
 def first_exponent(x: np.ndarray, y: np.ndarray) -> float:
-    """Slope of log y over log x between the first two points; NaN with fewer points, or if y[0] is not positive."""
+    """Return the slope of log y over log x between the first two points.
+
+    It is NaN if there are fewer points, or if y[0] is not positive.
+    """
     return float(np.log(y[1] / y[0]) / np.log(x[1] / x[0])) if len(x) > 1 and y[0] > 0 else np.nan
 
 
 def tracer_statistics(tracers: Frames, spectra: Mapping[str, np.ndarray], spacing: float) -> TracerStatistics:
-    """Measure tracers of mean distance `spacing` in frames at equal intervals.
+    """Return the statistics of tracers, measured in frames at equal intervals.
 
-    `spectra` holds `time` (m,) and `filtered` (m, shells), the energy spectra of the filtered flow.
+    `spectra` holds `time` (m,) and `filtered` (m, shells), the energy spectra of the filtered flow. `spacing` is the
+    mean spacing of the tracers.
     """
     times, every = tracers.times, -(-tracers.total // FOLLOWED)
     velocity = np.stack([tracers.read(frame, "velocity")[::every] for frame in range(times.size)])
@@ -107,9 +121,10 @@ def _energy_ratio(tracers: Frames, spectra: Mapping[str, np.ndarray]) -> tuple[n
 
 
 def _accelerations(velocity: np.ndarray) -> tuple[np.ndarray, float]:
-    """PDF and kurtosis of accelerations, both averaged over the intervals between frames.
+    """Return the PDF and the kurtosis of accelerations, both averaged over the intervals between frames.
 
-    Each interval is scaled with its own rms, so that the decay of the flow does not widen the tails.
+    `velocity` is (frames, n, 3). The accelerations of each interval are divided by their own rms, so that the decay of
+    the flow does not widen the tails.
     """
     probability, kurtosis = [], []
     for earlier, later in zip(velocity, velocity[1:]):

@@ -4,8 +4,9 @@ Each track is approximated by a cubic spline s(t) with a knot at each time t_i o
 
     sum_i |x_i - s(t_i)|^2 + mu h^5 int |s'''|^2 dt,    h the median interval of all tracks.
 
-This is the estimate for noise of equal variance and a jerk that is white noise (TrackFit; Gesemann, Huhn, Schanz and
-Schröder 2016). It damps frequencies above mu^(-1/6) / h. The ends need no condition.
+This estimate assumes that the measuring errors have equal variance and that the jerk, the third derivative of x, is
+white noise (TrackFit; Gesemann, Huhn, Schanz and Schröder 2016). The spline damps angular frequencies above
+mu^(-1/6) / h. It needs no condition at the ends of a track.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from scipy.linalg import solveh_banded
 from scipy.optimize import brentq
 from scipy.sparse import csr_array, dia_array
 
-DEGREE, LEAST_ROWS = 3, 3   # fewer rows do not determine a parabola, which has no jerk
-NO_NOISE, MOST = 1e-6, 1e6  # smallest and largest mu; the smallest damps no frequency that frames resolve
+DEGREE, LEAST_ROWS = 3, 3   # degree of a spline; fewest rows that determine a parabola, which has no jerk
+NO_NOISE, MOST = 1e-6, 1e6  # smallest and largest mu; the smallest damps no frequency that the frames resolve
 TRIED = 300                 # about the number of tracks from which mu is determined
 
 
@@ -31,7 +32,7 @@ class SmoothedTracks:
 
     Parameters
     ----------
-    rows : index of each row in the arguments of `smooth`; tracks with fewer than three rows are left out.
+    rows : index, in the arguments of `smooth`, of each row here. Tracks with fewer than three rows are left out.
     position, velocity : (rows, 3). Positions are continuous along a track.
     smoothing : mu of the splines.
     """
@@ -44,14 +45,15 @@ class SmoothedTracks:
 
 def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: float | None,
            noise: float = 0.0) -> SmoothedTracks:
-    """Fit splines to tracks.
+    """Return tracks after smoothing by splines.
 
     Parameters
     ----------
-    time, track : (rows,), in any order. position : (rows, 3), wrapped or not.
+    time, track : time of each row and number of its track, (rows,). Rows are in any order.
+    position : (rows, 3), wrapped into the cube or not.
     edge : edge of a periodic cube, or None. Particles must move by less than half an edge between rows of a track.
     noise : standard deviation of the error of a measured coordinate. It determines mu: the sum of the squared
-        residuals is then noise^2 times the number of degrees of freedom.
+        residuals is then noise^2 times the number of degrees of freedom. If it is 0, mu is NO_NOISE.
     """
     order = np.lexsort((time, track))
     ends = np.flatnonzero(np.diff(track[order], append=track[order][-1] - 1)) + 1
@@ -72,7 +74,10 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
 
 
 class Fit:
-    """The splines of tracks with the same times (n,). Positions are (tracks, n, 3); `interval` is h of the penalty."""
+    """The splines of tracks with the same times (n,).
+
+    `positions` is (tracks, n, 3). `interval` is h, the median interval of all tracks.
+    """
 
     def __init__(self, times: np.ndarray, positions: np.ndarray, interval: float) -> None:
         self.times, self.tracks = times, len(positions)
@@ -86,7 +91,7 @@ class Fit:
         self._penalty = interval**5 * jerk.T @ dia_array((np.diff(times)[None], [0]), shape=[len(times) - 1] * 2) @ jerk
 
     def spline(self, smoothing: float, values: np.ndarray | None = None) -> BSpline:
-        """The splines that approximate `values` (n, columns), by default the positions, with mu = `smoothing`."""
+        """Return the splines with mu = `smoothing` that approximate `values` (n, columns), by default the positions."""
         matrix = self._basis.T @ self._basis + smoothing * self._penalty
         bands = np.zeros((DEGREE + 1, matrix.shape[0]))
         for offset in range(DEGREE + 1):
@@ -95,20 +100,26 @@ class Fit:
         return BSpline(self._knots, solveh_banded(bands, right, lower=True), DEGREE)
 
     def residual(self, smoothing: float) -> tuple[float, float]:
-        """Sum of squared residuals, and its degrees of freedom: number of values minus trace of the smoother matrix."""
+        """Return the sum of squared residuals, and its number of degrees of freedom.
+
+        This number is the number of values minus the trace of the matrix that maps values to smoothed values.
+        """
         squares = float(np.sum((self.spline(smoothing)(self.times) - self._values) ** 2))
         influence = self.spline(smoothing, np.eye(len(self.times)))(self.times)
         return squares, 3 * self.tracks * (len(self.times) - float(np.trace(influence)))
 
     def derivatives(self, smoothing: float) -> Iterator[np.ndarray]:
-        """Yield position and velocity, each (tracks * n, 3), track after track."""
+        """Yield the smoothed positions, then the velocities, each (tracks * n, 3), track after track."""
         spline = self.spline(smoothing)
         for values in (spline(self.times), spline.derivative()(self.times)):
             yield np.moveaxis(values.reshape(len(self.times), self.tracks, 3), 1, 0).reshape(-1, 3)
 
 
 def _smoothing_of(fits: list[Fit], noise: float) -> float:
-    """The mu for which the residuals of the longest tracks have the variance of the noise."""
+    """Return the mu for which the residuals of the longest tracks have the variance noise^2.
+
+    Without such a value, return the nearest of NO_NOISE and MOST.
+    """
     longest = sorted(fits, key=lambda fit: -len(fit.times))
     chosen = longest[:np.searchsorted(np.cumsum([fit.tracks for fit in longest]), TRIED) + 1]
 
@@ -123,7 +134,7 @@ def _smoothing_of(fits: list[Fit], noise: float) -> float:
 
 
 def _unwrapped(positions: np.ndarray, edge: float | None) -> np.ndarray:
-    """Make positions (tracks, n, 3) in a periodic cube continuous. If `edge` is None, return them unchanged."""
+    """Return positions (tracks, n, 3) in a periodic cube as continuous tracks; unchanged if `edge` is None."""
     if edge is None:
         return positions
     moved = np.diff(positions, axis=1)
