@@ -5,7 +5,8 @@ from typing import Any
 
 __version__ = "2.0.0"
 
-# Public names by module. A module is imported on first access, so that reading a scene starts neither MPI nor torch.
+# The public names, by the module that defines them. A module is imported when one of its names is first used, so that
+# reading a scene starts neither MPI nor torch.
 _HOMES = {
     "eddies.api": ("check", "run", "simulate", "train"),
     "eddies.stored_run": ("StoredRun", "open_run"),

@@ -1,4 +1,4 @@
-"""`python -m eddies` is the command `eddies`."""
+"""Run the command `eddies` as `python -m eddies`."""
 
 import sys
 

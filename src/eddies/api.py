@@ -1,4 +1,4 @@
-"""The commands as Python functions. Each takes a scene, its name or its path, and returns when the work is done.
+"""The commands as Python functions. Each takes a scene, or the name or path of a scene, and returns when it is done.
 
 All ranks call a function together. Only this module and `cli` use MPI.COMM_WORLD, the communicator of the job.
 """
@@ -28,20 +28,22 @@ CHECKPOINT_SECONDS = 600.0
 
 
 def check(scene: Scene | str | Path, *, comm: Comm | None = None) -> None:
-    """Log estimates of a scene: resolution, memory, ranks and time. Writes no file. Raises SceneError if a run would be
-    refused."""
+    """Log estimates for a run of a scene: resolution, memory, largest number of ranks, and time. Writes no file.
+
+    Raises SceneError if a run would be refused.
+    """
     with _job(comm) as comm:
         import_module("eddies.workflows.check").run(scene if isinstance(scene, Scene) else load_scene(scene), comm)
 
 
 def run(scene: Scene | str | Path, *, stages: Sequence[str] | None = None, output: str | Path | None = None,
         overwrite: bool = False, variants: Sequence[str] = (), comm: Comm | None = None) -> Path:
-    """Run the stages of a scene and return the run directory, which is `output` or runs/NAME.
+    """Run the stages of a scene and return the run directory.
 
     Parameters
     ----------
     stages : names such as "dns" and "train-kernel"; run in the order of the pipeline. None: all stages of the scene.
-    output : the run directory.
+    output : the run directory; None: runs/NAME, where NAME is the name of the scene.
     overwrite : replace products and checkpoints that were made with other settings; if False, they are an error.
         Complete products of the same settings are always kept.
     variants : the variants to run; empty for all.
@@ -66,23 +68,23 @@ def run(scene: Scene | str | Path, *, stages: Sequence[str] | None = None, outpu
 
 def train(scene: Scene | str | Path, *, output: str | Path | None = None, overwrite: bool = False,
           variants: Sequence[str] = (), comm: Comm | None = None) -> Path:
-    """Train the model of a scene, from the ground truth and kernel in the run directory; arguments as for `run`."""
+    """Train the model of a scene with the ground truth and kernel in its run directory; arguments as for `run`."""
     return run(scene, stages=("train",), output=output, overwrite=overwrite, variants=variants, comm=comm)
 
 
 def simulate(scene: Scene | str | Path, *, output: str | Path | None = None, overwrite: bool = False,
              variants: Sequence[str] = (), comm: Comm | None = None) -> Path:
-    """Make the rollout of a scene, from the ground truth and model in the run directory; arguments as for `run`."""
+    """Make the rollout of a scene with the ground truth and model in its run directory; arguments as for `run`."""
     return run(scene, stages=("simulate",), output=output, overwrite=overwrite, variants=variants, comm=comm)
 
 
 @contextmanager
 def _job(comm: Comm | None) -> Iterator[Comm]:
-    """Context that gives the communicator of a job, by default the one of all ranks.
+    """Context that gives the communicator of a job: `comm`, or that of all ranks if `comm` is None.
 
     Log lines go to standard output unless the program has set up logging. With several ranks, an error ends the job by
     MPI_Abort in two cases: if only some ranks raise it, because the others may wait for them; and if HDF5 could not
-    write a file, because it would crash at exit.
+    write a file, because the process would crash at exit.
     """
     default_to_one_thread()
     from mpi4py import MPI

@@ -1,4 +1,4 @@
-"""The command `eddies`: reads the command line, runs a command, and turns errors into messages.
+"""The command `eddies`. It reads the command line, runs a command, and turns errors into messages.
 
 Only this module and `api` use MPI.COMM_WORLD; all other modules get the communicator as an argument.
 """
@@ -35,7 +35,7 @@ log = logging.getLogger("eddies")
 
 BAD_INPUT = 2
 INTERRUPTED = 128 + signal.SIGINT
-STOPPED = 75  # EX_TEMPFAIL: the same command continues
+STOPPED = 75  # EX_TEMPFAIL; the same command, given again, continues the work
 REPORT = Path("report") / "index.html"
 STOP_SIGNALS = (signal.SIGUSR1, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 STOPPING = b"eddies: stops after this step; a second interrupt ends it at once\n"
@@ -59,8 +59,9 @@ def main(arguments: list[str] | None = None) -> int:
         complain(f"error: {refusal}")
         code = code or BAD_INPUT
     if code == INTERRUPTED:
-        # Python remembers an interrupt of code compiled from a string (dataclasses use such code) until such code runs
-        # again. A program started with -m would then end by the signal (tests/test_bad_input.py, on interrupts).
+        # If an interrupt ends code that was compiled from a string, as in dataclasses, Python remembers it until such
+        # code runs again. If it remembers it at exit, a program started with -m ends by the signal, not with this exit
+        # code (tests/test_bad_input.py, on interrupts).
         exec("")
     if usage:
         sys.exit(code)
@@ -90,7 +91,7 @@ def run(arguments: list[str] | None) -> int:
         require_connected(MPI.COMM_WORLD)
     except NotConnected as error:
         if not error.first:
-            time.sleep(PATIENCE)  # launchers kill all ranks when one ends, so the first rank must report before
+            time.sleep(PATIENCE)  # a launcher kills all ranks when one ends, so this one waits for the first to report
         else:
             complain(f"error: {error}")
         return BAD_INPUT
@@ -123,7 +124,8 @@ def run(arguments: list[str] | None) -> int:
 
 
 def complain(text: str, prefix: str = "eddies: ") -> None:
-    """Write the lines of a message to standard error. A failed write, as to a closed pipe, raises nothing."""
+    """Write a message to standard error, each line after `prefix`. A failed write, as to a closed pipe, raises
+    nothing."""
     with contextlib.suppress(OSError):
         sys.stdout.flush()
         sys.stderr.write("".join(f"{prefix}{line}\n" for line in text.split("\n")))
@@ -131,7 +133,8 @@ def complain(text: str, prefix: str = "eddies: ") -> None:
 
 
 def catch_signals() -> list[int]:
-    """Record signals that ask for a stop. Returns the list that receives their numbers; stages check it at each step.
+    """Record the signals that ask for a stop. Returns the list to which each signal adds its number; stages check this
+    list at each step.
 
     Schedulers send SIGUSR1 or SIGTERM before the time limit; the keyboard sends SIGINT, and a closed terminal SIGHUP. A
     signal that is ignored, as by nohup, stays ignored. The second signal of a kind, except SIGUSR1, ends the process at
@@ -143,7 +146,7 @@ def catch_signals() -> list[int]:
         received.append(number)
         if number != signal.SIGUSR1:
             signal.signal(number, signal.SIG_DFL)
-        if number == signal.SIGINT and sys.__stderr__ is not None:  # else another file may have the number of stderr
+        if number == signal.SIGINT and sys.__stderr__ is not None:  # if closed, another file may have its number
             with contextlib.suppress(OSError):  # a closed pipe or a full disk must not end the run
                 os.write(sys.__stderr__.fileno(), STOPPING)
 
@@ -160,7 +163,7 @@ def catch_signals() -> list[int]:
 
 
 def release_signals(received: list[int]) -> None:
-    """Let signals end the process at once, also those received so far; used for commands that take seconds."""
+    """Let signals end the process at once, also the signals in `received`. Commands that take seconds use this."""
     for number in STOP_SIGNALS:
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
@@ -172,8 +175,9 @@ def end_with_error(error: BaseException, comm: Comm) -> int:
     """Report an error once and return its exit code, or end all ranks by MPI_Abort.
 
     If all ranks meet a mistake in the input or an interrupt, rank 0 prints one line. MPI_Abort ends the job in three
-    cases: only some ranks meet the error or interrupt, and the others may wait for them; with several ranks, the error
-    is not the user's; or HDF5 could not write a file, and would crash at exit.
+    cases: only some ranks meet the error or interrupt, so that the others may wait for them; there are several ranks,
+    and the error is neither a mistake in the input nor an interrupt; or HDF5 could not write a file, so that the
+    process would crash at exit.
     """
     from eddies.io.new_files import writing_failed
     interrupted = isinstance(error, KeyboardInterrupt)
@@ -198,7 +202,7 @@ def end_with_error(error: BaseException, comm: Comm) -> int:
 
 
 def run_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
-    """Run one stage or all stages of a scene, until a signal, a file STOP or the limit of wall time."""
+    """Run one stage or all stages of a scene. A signal, a file STOP or the limit of wall time ends the run early."""
     from eddies.parallel.stop import StopRequest
     from eddies.stages import run_stages
     start = time.perf_counter()
@@ -237,19 +241,19 @@ def export_command(options: argparse.Namespace, comm: Comm) -> None:
 
 
 def check_command(options: argparse.Namespace, comm: Comm) -> None:
-    """Log estimates of a scene before it runs."""
+    """Log estimates for a run of a scene, or of each variant that the command line names."""
     for scene in checked_scenes(options):
         import_module("eddies.workflows.check").run(scene, comm, options.json)
 
 
 def time_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
-    """Measure the seconds of a step of each stage of a scene."""
+    """Measure how long a step of each stage takes, for a scene or for each variant that the command line names."""
     for scene in checked_scenes(options):
         import_module("eddies.workflows.timing").run(scene, comm, signals)
 
 
 def checked_scenes(options: argparse.Namespace) -> list[Scene]:
-    """The variants that the command line names, or the whole scene if it names none."""
+    """Return the variants that the command line names, or the whole scene if it names none."""
     whole = load_scene(options.scene, options.overrides, options.removals)
     whole.check_variants(options.variants)
     return [whole.variant[name] for name in options.variants] or [whole]
@@ -275,7 +279,7 @@ def status_command(options: argparse.Namespace, comm: Comm) -> None:
 
 
 def diff_command(options: argparse.Namespace, comm: Comm) -> None:
-    """Print the differences between two runs."""
+    """Print the differences between two runs, or between runs of variants."""
     from eddies.stored_run import variant_directory
     runs = [run for run in (options.one, options.other) if run is not None]
     names = options.variants

@@ -12,7 +12,7 @@ import eddies
 from eddies.errors import UserError
 from eddies.pipeline import STAGES
 
-# Examples at the end of `--help` of a command.
+# The examples at the end of the help of each command.
 EXAMPLES = {
     "run": ("eddies run hit-small", "mpirun -n 2 eddies run mine.toml --set training.steps=200 --output runs/second"),
     "dns": ("eddies dns hit-small --set seed=2 --output runs/hit-small-seed-2",),
@@ -32,7 +32,7 @@ EXAMPLES = {
 
 
 def parse_arguments(arguments: list[str] | None, rank: int) -> argparse.Namespace:
-    """The options of the command line. Only rank 0 prints help and usage errors."""
+    """Return the options in `arguments`, by default those of the command line. Only rank 0 prints help and errors."""
     with contextlib.ExitStack() as stack:
         if rank > 0:
             silence = stack.enter_context(open(os.devnull, "w"))
@@ -42,7 +42,7 @@ def parse_arguments(arguments: list[str] | None, rank: int) -> argparse.Namespac
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser with all sub-commands."""
+    """Return the parser of the command line, with all sub-commands."""
     parser = argparse.ArgumentParser(prog="eddies", description=eddies.__doc__,
                                      epilog="The variable EDDIES_LOG sets what is logged: debug (as --verbose), info, "
                                             "outcome (as --quiet) or warning.")
@@ -92,14 +92,14 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def add_command(commands: argparse._SubParsersAction, name: str, about: str) -> argparse.ArgumentParser:
-    """Add a sub-command with its examples, and return its parser."""
+    """Add a sub-command with its examples, and return its parser; `about` describes the command in the help."""
     form = argparse.RawDescriptionHelpFormatter
     return commands.add_parser(name, help=about, description=about, formatter_class=form,
                                epilog="\n  ".join(["examples:", *EXAMPLES[name]]))
 
 
 def add_run(parser: argparse.ArgumentParser, name: str, nargs: str | None = None) -> None:
-    """Add an argument for a run directory."""
+    """Add an argument for a run directory; `nargs` = "?" makes it optional."""
     parser.add_argument(name, type=directory, metavar="RUN", nargs=nargs, help="a run directory, such as runs/tiny")
 
 
@@ -108,7 +108,7 @@ class OptionError(UserError):
 
 
 def directory(text: str) -> Path:
-    """A directory that is named on the command line; it need not exist."""
+    """Return the path of a directory that the command line names; the directory need not exist."""
     if not text:
         raise OptionError("an empty text is not a directory; give a name, or . for the working directory")
     try:
@@ -119,7 +119,7 @@ def directory(text: str) -> Path:
 
 
 def positive(text: str) -> float:
-    """A positive number of the command line."""
+    """Return a positive number that the command line gives as `text`."""
     value = float(text)
     if not value > 0:
         raise argparse.ArgumentTypeError(f"{text}: must be larger than 0")
@@ -141,7 +141,8 @@ def add_variants(parser: argparse.ArgumentParser, about: str) -> None:
 
 
 def add_job_options(parser: argparse.ArgumentParser, output: str) -> None:
-    """Add options of long commands: output, replacement of work, and limits of time."""
+    """Add the options of long commands: run directory, replacement of older work, and limits of wall time. `output` is
+    the help of the option --output."""
     parser.add_argument("--output", type=directory, metavar="DIR", help=output)
     parser.add_argument("--overwrite", action="store_true", help="replace products and checkpoints of other settings, "
                         "which are otherwise an error. Work of the same settings is kept and continued")

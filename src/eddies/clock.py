@@ -27,7 +27,7 @@ class Clock:
 
     @property
     def remaining(self) -> float:
-        """Remaining time; a remainder within the round-off of the sum of steps is 0."""
+        """Simulated time that remains; 0 if no more is left than the round-off of the sum of all steps."""
         left = self.end - self.time
         return left if left > 1e-9 * max(self.time, 1.0) else 0.0
 
@@ -41,21 +41,21 @@ class Clock:
         self.end = self.time
 
     def state_dict(self) -> dict[str, float]:
-        """The state of the clock for a checkpoint."""
+        """Return the state of the clock, for a checkpoint."""
         return {"time": self.time, "steps": self.steps, "end": self.end}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """Restore a state from `state_dict`."""
+        """Restore a state that `state_dict` has returned."""
         self.time, self.steps, self.end = state["time"], int(state["steps"]), state["end"]
 
     def tick(self, step: float) -> None:
-        """Advance by one step."""
+        """Advance by one step of size `step`."""
         self.steps += 1
         self.time += step
 
 
 def ladder_step(largest: float, bound: float) -> float:
-    """The largest step of the ladder `largest` * 2^-m, m = 0, 1, ..., that does not exceed `bound`.
+    """Return the largest step of the ladder `largest` * 2^-m, m = 0, 1, ..., that does not exceed `bound`.
 
     Raises ValueError if `bound` is not positive.
     """
@@ -68,14 +68,14 @@ class ProgressLine:
     """Logs progress and remaining time every few seconds of wall time, or after every step with --verbose.
 
     Call it after every step. The line gives the median of the seconds per step, without the first two steps and without
-    the time in `storing`. The share of `storing` in the wall time is given separately.
+    the time spent in the context `storing`. It also gives the share of this time in the wall time.
 
     Parameters
     ----------
     stage : first word of the line.
     describe : returns the state of the stage as text. It must not communicate, because only ranks that log call it.
     done : fraction of the stage that an earlier job has done; the estimate of the remaining time leaves it out.
-    unit : name of what is counted.
+    unit : name of what is counted, such as "step" or "frame".
     """
 
     def __init__(self, stage: str, describe: Callable[[], str], done: float = 0.0, unit: str = "step") -> None:
@@ -119,18 +119,21 @@ class ProgressLine:
                  duration(left))
 
     def renew(self) -> None:
-        """Begin a new median: the following steps are of another kind."""
+        """Forget the seconds of earlier steps, because the following steps are of another kind."""
         self._seconds.clear()
         self._taken = 0
 
 
 def pace_in_words(seconds: float, storing: float, unit: str = "step") -> str:
-    """Seconds of a step as text, such as "0.430 s/step (storing: 46 % of the time)"."""
+    """Return the seconds per step as text, such as "0.430 s/step (storing: 46 % of the time)".
+
+    `storing` is the share of the wall time that is spent on storing, 0 to 1.
+    """
     return f"{seconds:.3f} s/{unit}" + (f" (storing: {100 * storing:.0f} % of the time)" if storing > 0 else "")
 
 
 def duration(seconds: float) -> str:
-    """Seconds as text, such as "42 s", "3 min 20 s", "2 h 05 min" or "1.2e+30 years"."""
+    """Return a number of seconds as text, such as "42 s", "3 min 20 s", "2 h 05 min" or "1.2e+30 years"."""
     if seconds >= YEARS * YEAR:
         return f"{seconds / YEAR:.2g} years"
     seconds = max(int(round(seconds)), 0)

@@ -1,4 +1,4 @@
-"""The base of errors that the user can correct."""
+"""The base class of errors that the user can correct."""
 
 
 class UserError(Exception):

@@ -23,7 +23,7 @@ class ImportPathError(UserError, ValueError):
 
 
 def is_path(name: str) -> bool:
-    """Whether a name is an import path, not a built-in name."""
+    """Return whether a name is an import path, not a built-in name."""
     return ":" in name
 
 
@@ -33,14 +33,14 @@ def short_name(name: str) -> str:
 
 
 def search_in(folder: str | Path) -> None:
-    """Let import paths find modules in this folder too. It is searched after all other folders."""
+    """Let import paths find modules in this folder too. Python searches the folder after all others."""
     folder = str(Path(folder).resolve())
     if folder not in sys.path:
         sys.path.append(folder)
 
 
 def load(path: str) -> Any:
-    """Import the object of an import path.
+    """Import and return the object that an import path names.
 
     Raises ImportPathError if the form is wrong, the module or name is missing, or the import raises an exception.
     """
@@ -62,7 +62,7 @@ def load(path: str) -> Any:
 
 @contextmanager
 def users_code(called: Any, problem: type[UserError], hint: str = "") -> Iterator[None]:
-    """Convert an exception of `called`, a user's class or function, into an error of type `problem`.
+    """Context that converts an exception of `called`, a user's class or function, into an error of type `problem`.
 
     The text of the error names `called` and, if known, the file and the line; it ends with `hint`. A UserError or a
     MemoryError passes unchanged. All exceptions pass unchanged if `called` belongs to this package. An exception whose
@@ -84,8 +84,10 @@ def users_code(called: Any, problem: type[UserError], hint: str = "") -> Iterato
 
 
 def origins(paths: Iterable[str]) -> dict[str, dict[str, str | None]]:
-    """Return a table for each import path: the `version` of its package, None if the package is not installed, and the
-    `sha256` of its source file, None if there is no such file."""
+    """Return, for each import path, a table with the `version` of its package and the `sha256` of its source file.
+
+    The version is None if the package is not installed. The SHA-256 is None if there is no source file.
+    """
     return {path: {"version": _version(path), "sha256": _source_digest(path)} for path in sorted(set(paths))}
 
 

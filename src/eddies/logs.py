@@ -16,8 +16,11 @@ LEVELS = {"debug": logging.DEBUG, "info": logging.INFO, "outcome": OUTCOME, "war
 
 
 def configure_logging(rank: int, level: str | None = None) -> None:
-    """Send the logger "eddies" to standard output. The `level` of rank 0 is debug, info, outcome or warning; by default
-    the value of EDDIES_LOG, or info. Raises UserError if EDDIES_LOG has another value."""
+    """Send the lines of the logger "eddies" to standard output.
+
+    `level` is the level of rank 0: debug, info, outcome or warning. If it is None, the variable EDDIES_LOG gives the
+    level; without the variable it is info. Raises UserError if EDDIES_LOG has another value.
+    """
     name = level or os.environ.get("EDDIES_LOG", "info")
     if name not in LEVELS:
         raise UserError(f"EDDIES_LOG = {name}: must be one of {', '.join(LEVELS)}")
@@ -37,7 +40,7 @@ class Output:
 
     def __init__(self) -> None:
         for name in ("stdout", "stderr"):
-            if getattr(sys, name) is None:  # closed: the next file opened would get its descriptor
+            if getattr(sys, name) is None:  # the stream is closed, and the next opened file would get its descriptor
                 setattr(sys, name, open(os.devnull, "w"))
             if hasattr(getattr(sys, name), "reconfigure"):
                 getattr(sys, name).reconfigure(errors="backslashreplace")
@@ -57,7 +60,8 @@ class Output:
         self._try(self._stream.flush)
 
     def end(self) -> str | None:
-        """Restore the stream. Returns None, or a message if some text could not be written."""
+        """Restore standard output. Returns the message about a failed write; None if no write failed, or if the reader
+        closed the pipe."""
         self.flush()
         sys.stdout = self._stream
         if self._lost:

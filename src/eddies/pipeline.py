@@ -12,7 +12,7 @@ class Stage:
     name : name of the stage and of its command.
     about : its result in words, for the help of the command.
     section : the section of a scene that asks for the stage; None if the stage is always run.
-    product : kind of its product, the file PRODUCT.h5 in the run directory; None if it has no product.
+    product : kind of its product, such as "model" for the file model.h5 in the run directory; None without a product.
     reads : sections and properties of a scene on which its product depends, besides those of the stages before it (see
         workflows/run_directory/fingerprints.py).
     depends_on : all stages on which its product depends, if the scene has them.

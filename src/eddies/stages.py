@@ -55,7 +55,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     `take_over` is true, a job that holds the lock is ended. The failure of a variant does not stop the other variants.
 
     Raises:
-        Stopped: `stop` requested it; the running stage has stored what the next run needs.
+        Stopped: `stop` asked the job to end; the running stage has stored what the next run needs.
         SceneError: a file STOP is present at the start, or the scene lacks a section, cannot use this number of ranks,
             needs a file that is too large for rank 0 to write, or has settings that differ from those of an input.
         RunInUse, RunTakenOver: another job works in the directory, or has taken it over.
@@ -126,7 +126,10 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
 @contextmanager
 def recording_failure(failures: dict[str, str], variant: str | None, directory: Path, comm: Comm) -> Iterator[None]:
     """Context for the work on a variant. If all ranks raise a UserError, only this work ends, and other variants go on.
-    The error is stored in `failures` under the name of the variant, and written into its directory."""
+
+    The error is stored in `failures` under the name `variant`, and written into `directory`. If `variant` is None, the
+    work is for all variants, and its error is raised.
+    """
     errors = comm.Dup()  # other ranks may wait in `comm` for a message when one rank fails
     try:
         yield
@@ -142,7 +145,7 @@ def recording_failure(failures: dict[str, str], variant: str | None, directory: 
 
 
 def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None:
-    """Run those stages of a step that are not done. The lock of its directory is held."""
+    """Run the stages of a step that are not done yet. The caller holds the lock of the step's directory."""
     scene, directory = step.scene, step.directory
     if step.links:  # the other inputs were checked before the first step
         check_inputs(step, comm)
@@ -173,15 +176,17 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
 
 @contextmanager
 def working_in(comm: Comm, directory: Path, stop: StopRequest, take_over: bool) -> Iterator[None]:
-    """Hold the lock of a directory. If another job takes it over, the next call of `stop` ends this job."""
+    """Context that holds the lock of a directory. If another job takes over the directory, the next call of `stop`
+    raises an error, which ends this job."""
     with lock_directory(comm, directory, take_over) as lock_lost, stop.watching(lock_lost):
         yield
 
 
 def run_stage(name: str, arguments: Sequence[Any], comm: Comm, directory: Path, stop: StopRequest,
               begun: bool) -> None:
-    """Run one stage with its arguments and record its wall time, also if it is stopped. If `begun` is true, the stage
-    continues from a checkpoint, and the time of earlier runs is added."""
+    """Run one stage and record its wall time, also if it is stopped. `arguments` are those of the function `run` in the
+    module of the stage. If `begun` is true, the stage continues from a checkpoint, and its time is added to that of
+    earlier runs."""
     log.info("%s: starts on %d %s", name, comm.size, "rank" if comm.size == 1 else "ranks")
     start = time.perf_counter()
     of_tracks = name == "dns" and arguments[0].tracks is not None
@@ -223,7 +228,8 @@ def check_inputs(step: Step, comm: Comm, made: Collection[Path] = ()) -> None:
 
 
 def prepare_directory(text: str, comm: Comm, directory: Path) -> None:
-    """Write the text of the scene into a run directory and remove unfinished files of killed jobs; collective."""
+    """Write the text of the scene into a run directory. Remove unfinished files of killed jobs and the error of an
+    earlier failure; collective."""
     def write() -> None:
         for leftover in directory.glob("*.partial"):
             leftover.unlink()
@@ -234,7 +240,8 @@ def prepare_directory(text: str, comm: Comm, directory: Path) -> None:
 
 
 def add_seconds(stage: str, seconds: float, comm: Comm, directory: Path) -> float:
-    """Add to the wall time of a stage in stage_seconds.json and return the sum. Killed and failed runs add none."""
+    """Add `seconds` to the wall time of a stage in stage_seconds.json and return the sum. The sum lacks the time of
+    runs that were killed or failed."""
     path = directory / SECONDS
 
     def add() -> float:

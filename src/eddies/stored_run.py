@@ -30,8 +30,8 @@ SPECTRA = {"flow": ("ground_truth/spectra", "energy"), "filtered": ("ground_trut
 class StoredRun:
     """The content of a run directory, read on access.
 
-    Groups of arrays are xarray Datasets with coordinates and units, whose values are read when they are used. Without
-    xarray they are dictionaries of numpy arrays. Access to something that is missing raises UserError.
+    Groups of arrays are xarray Datasets with coordinates and units. Their values are read when they are used. If xarray
+    is not installed, groups are dictionaries of numpy arrays. Access to something that is missing raises UserError.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -57,7 +57,7 @@ class StoredRun:
         return found + [name for name in MADE if name not in found and "rollout" in self.products]
 
     def __getitem__(self, name: str) -> Any:
-        """The group of arrays with the name "PRODUCT/GROUP"."""
+        """Return the group of arrays with the name "PRODUCT/GROUP"."""
         from eddies.io.datasets import open_group
         product, _, group = name.partition("/")
         if product not in self.products:
@@ -65,7 +65,7 @@ class StoredRun:
         return self._made(group) if name in MADE else open_group(self.path / MAKER_OF[product].file, group)
 
     def _made(self, group: str) -> Any:
-        """A group that is computed from the rollout, frame by frame."""
+        """Return a group that is computed from the rollout, frame by frame."""
         from mpi4py import MPI
 
         from eddies.io.datasets import as_dataset, computed_array, known_array
@@ -98,7 +98,7 @@ class StoredRun:
         return load_scene(self.path / "scene.toml")
 
     def variant(self, name: str) -> StoredRun:
-        """The run of a variant; if the scene has realisations, its run on the first realisation."""
+        """Return the run of a variant; if the scene has realisations, the run of the variant on the first one."""
         return StoredRun(variant_directory(self.path, name))
 
     @property
@@ -117,10 +117,10 @@ class StoredRun:
         return read_metrics(path)
 
     def trajectories(self, ids: Any = None, of: str = "model", unwrapped: bool = False) -> Any:
-        """Position, velocity and other columns of all particles, or of those with the given `ids`.
+        """Return position, velocity and other columns of all particles, or of the particles with the given `ids`.
 
         `of` is "model" or "truth" for the rollout, or "tracers" for the ground truth. If `unwrapped` is true, positions
-        are continuous beyond the periodic cube.
+        do not jump where a particle crosses a face of the periodic cube.
         """
         found = self[chosen(TRAJECTORIES, of)]
         if ids is not None and not isinstance(ids, slice):
@@ -143,18 +143,19 @@ class StoredRun:
         return found
 
     def field(self, name: str = "velocity", time: float | None = None, of: str = "filtered") -> Any:
-        """A field on its grid, (component, z, y, x), at the stored time nearest to `time`, by default the last one.
+        """Return a field on its grid, (component, z, y, x), at the stored time nearest to `time`, by default the last.
 
-        `of` is "filtered" or "unfiltered" for the flow, "final" for a run without tracers, "reconstructed" for the
-        fields of [reconstruction], or "model" or "truth" for the field that the kernel makes from the particles.
+        `of` is "filtered" or "unfiltered" for the flow, "final" for the flow of a run without tracers, "reconstructed"
+        for the fields of [reconstruction], or "model" or "truth" for the field that the kernel makes from the particles
+        of the rollout. With xarray, a scalar field has the axes (z, y, x).
         """
         return at_time(self[chosen(FIELDS, of)], name, time)
 
     def spectrum(self, of: str = "model", time: float | None = None) -> Any:
-        """Energy spectrum at the stored time nearest to `time`, by default the last one.
+        """Return the energy spectrum at the stored time nearest to `time`, by default the last one.
 
-        `of` is "flow" for the unfiltered flow, "filtered" for the filtered one, or "model" or "truth" for a
-        least-squares fit to the velocities of the particles.
+        `of` is "flow" for the unfiltered flow, "filtered" for the filtered flow, or "model" or "truth" for a
+        least-squares fit to the velocities of the particles of the rollout.
         """
         group, column = chosen(SPECTRA, of)
         return at_time(self[group], column, time)
@@ -173,12 +174,13 @@ class StoredRun:
 
 
 def open_run(path: str | Path) -> StoredRun:
-    """Open a run directory."""
+    """Open a run directory and return its content."""
     return StoredRun(path)
 
 
 def variant_directory(path: Path, name: str) -> Path:
-    """The directory of a variant in a run directory. Raises SceneError if the scene has no such variant."""
+    """Return the directory of a variant in the run directory `path`. If the scene has realisations, it is that of the
+    first one. Raises SceneError if the scene has no such variant."""
     from eddies.workflows.variants import rollouts
     scene = load_scene(path / "scene.toml")
     scene.check_variants([name])
@@ -186,22 +188,25 @@ def variant_directory(path: Path, name: str) -> Path:
 
 
 def chosen(table: dict[str, Any], of: str) -> Any:
-    """The entry of a table with the name `of`. Raises UserError, which lists the valid names, if there is none."""
+    """Return the entry of a table with the name `of`. Raises UserError with the valid names if there is none."""
     if of not in table:
         raise UserError(f'of = "{of}": must be one of {", ".join(table)}')
     return table[of]
 
 
 def check_ids(ids: np.ndarray, count: int) -> None:
-    """Raise UserError for ids that are not integers from 0 to count - 1."""
+    """Raise UserError if an id is not an integer from 0 to `count` - 1."""
     if ids.size and (ids.dtype.kind not in "iu" or not 0 <= ids.min() <= ids.max() < count):
         raise UserError(f"ids = {shortened(str(ids.tolist()))}: must be integers from 0 to {count - 1}, the particles "
                         "of the run")
 
 
 def at_time(found: Any, name: str, time: float | None) -> Any:
-    """A variable at the stored time nearest to `time`, or at the last stored time if `time` is None. Raises UserError
-    for an unknown variable, and for a time outside the stored times by more than their longest interval."""
+    """Return the variable `name` of a group at the stored time nearest to `time`, or at the last one if `time` is None.
+
+    Raises UserError for an unknown variable, and if `time` lies before the first or after the last stored time by more
+    than the longest interval between stored times.
+    """
     if name not in found or name == "time":
         raise UserError(f'"{name}": no such variable; there are {", ".join(key for key in found if key != "time")}')
     times = np.asarray(found["time"])

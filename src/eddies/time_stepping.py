@@ -1,8 +1,8 @@
 """Time steppers for du/dt = L u + N(u): exponential time differencing and explicit Runge-Kutta.
 
 A stepper uses four methods of an equation: `nonlinear(state)` is N, `linear(state)` is L u, `linear_function(f, step)`
-is the operator f(step L), and `combine((operator, state), ...)` is the sum of such operators applied to states. States
-add like arrays.
+is the operator f(step L), and `combine((operator, state), ...)` applies each operator to its state and returns the sum.
+States add like arrays.
 """
 
 from __future__ import annotations
@@ -14,16 +14,17 @@ import numpy as np
 
 ScalarFunction = Callable[[np.ndarray], np.ndarray]
 
-# Below this modulus the closed forms of the phi functions lose digits to cancellation.
+# If the modulus of z is below this, the closed form of phi(z) loses digits to cancellation. The same holds for the
+# divided difference of two arguments whose distance is below this.
 _CANCELLATION_RADIUS = 0.5
 _CONTOUR = np.exp(2j * np.pi * (np.arange(32) + 0.5) / 32)
 
 
 def phi(order: int, z: np.ndarray) -> np.ndarray:
-    """phi_n(z) = (exp(z) - sum_{j<n} z^j / j!) / z^n for n = 1, 2, 3; complex, same shape as z.
+    """Return phi_n(z) = (exp(z) - sum_{j<n} z^j / j!) / z^n for the order n = 1, 2 or 3; complex, in the shape of z.
 
-    Near zero the closed form is averaged over the unit circle around z, which is exact for an entire function up to
-    the (negligible) 32nd term of its Taylor series (Kassam and Trefethen 2005).
+    Near zero the result is the mean of the closed form at 32 points of the unit circle around z. For an entire function
+    this is exact up to the 32nd term of its Taylor series, which is negligible (Kassam and Trefethen 2005).
     """
     z = np.asarray(z, complex)
     near = np.abs(z) < _CANCELLATION_RADIUS
@@ -42,9 +43,10 @@ def _phi_closed_form(order: int, z: np.ndarray) -> np.ndarray:
 
 
 def divided_difference(function: ScalarFunction, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """f[z1, z2] = (f(z1) - f(z2)) / (z1 - z2), and its limit f'(z) where z1 = z2 = z; f must be entire.
+    """Return (f(z1) - f(z2)) / (z1 - z2), or its limit f'(z) where z1 = z2 = z, for an entire `function` f.
 
-    If the arguments are close, Cauchy's formula is used, on the unit circle around their mean.
+    `first` holds the arguments z1 and `second` the arguments z2. Where the two are close, Cauchy's formula is used on
+    the unit circle around their mean.
     """
     first, second = np.asarray(first, complex), np.asarray(second, complex)
     close = np.abs(first - second) < _CANCELLATION_RADIUS
@@ -71,7 +73,7 @@ class ETDRK4:
         self._operators: dict[float, list[Any]] = {}
 
     def __call__(self, state: np.ndarray, step: float) -> np.ndarray:
-        """The state after one step of size `step`."""
+        """Return the state after one step of size `step`."""
         full, half, q, f1, f2, f3 = self._operators.get(step) or self._prepare(step)
         N, combine = self.equation.nonlinear, self.equation.combine
         n0 = N(state)
@@ -98,7 +100,8 @@ class ETDRK4:
 
 
 class RungeKutta4:
-    """The classical explicit fourth-order method for L and N alike, for comparisons of error and run time."""
+    """The classical explicit Runge-Kutta method of fourth order, for L and N alike. It serves for comparisons of error
+    and run time."""
 
     evaluations = 4
 
@@ -106,7 +109,7 @@ class RungeKutta4:
         self.equation = equation
 
     def __call__(self, state: np.ndarray, step: float) -> np.ndarray:
-        """The state after one step of size `step`."""
+        """Return the state after one step of size `step`."""
         k1 = self._rate(state)
         k2 = self._rate(state + step / 2 * k1)
         k3 = self._rate(state + step / 2 * k2)
