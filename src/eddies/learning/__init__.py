@@ -1,1 +1,1 @@
-"""Training on particles distributed over ranks: losses are global, gradients are summed over ranks."""
+"""Training on particles of all ranks: a loss is that of all particles, and gradients are summed over ranks."""

@@ -29,7 +29,11 @@ HISTOGRAM_BINS, HISTOGRAM_REACH = 41, 5.0
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of the losses besides the trajectory loss, whose weight is 1. The power loss is not part of Eq. 15."""
+    """Weights of the losses. The trajectory loss has weight 1.
+
+    `field` is the weight of Eq. 13, and `velocity_kl` and `acceleration_kl` are those of Eq. 14 for the two quantities.
+    The power loss is not part of Eq. 15.
+    """
 
     field: float = 0.0
     velocity_kl: float = 0.0
@@ -39,9 +43,9 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class KernelNeighborhood:
-    """Halo and neighbour list that reach as far as the support of a kernel.
+    """Halo and neighbour list that reach as far as the support of a kernel, for averages with this kernel.
 
-    `position` (s, 3) and `volumes` (s,) hold the owned particles first, then the ghosts.
+    `position` (s, 3) and `volumes` (s,) are those of the owned particles, followed by those of the ghosts.
     """
 
     kernel: SmoothingKernel
@@ -52,11 +56,12 @@ class KernelNeighborhood:
 
 @dataclass(frozen=True)
 class FieldLater:
-    """Particles and filtered flow one frame after the training frame, whose true rates the model is fitted to.
+    """Particles and filtered velocity one frame after a training frame, for the field loss.
 
     Parameters
     ----------
-    position, velocity : (n, 3), rows as in the training frame; positions are not wrapped into the box.
+    position, velocity : true values (n, 3) of the particles, with rows as in the training frame. Positions are not
+        wrapped into the box.
     span : time from the frame before the training frame to the frame after it.
     points, field : this rank's grid points (m, 3), and the filtered velocity (m, 3) there.
     """
@@ -69,16 +74,18 @@ class FieldLater:
 
 
 class TrainingFrame:
-    """The particles of one frame with their true rates, and the model's terms at these particles; collective.
+    """The particles of one frame with their true rates, and the rates that the model predicts for them.
 
-    Terms that are linear in their parameters are evaluated once, here.
+    The constructor is collective. It evaluates the terms that are linear in their parameters; `kept` holds the results
+    by name of the term.
 
     Parameters
     ----------
     dynamics : evaluates the model on the slabs of the particles. Each frame needs dynamics of its own.
     particles : the particles at the time of the frame.
     acceleration, density_rate : true rates (n, 3) and (n,); the density rate is None if no term reads the density.
-    later : the filtered flow that the field loss compares with; if None, this loss compares with the true particles.
+    later : the filtered velocity one frame later, with which the field loss compares. If it is None, this loss compares
+        with the true accelerations.
 
     `acceleration_rms` and `density_rate_rms` are the rms of one component of the true rates over all ranks. `total` is
     the number of particles of all ranks.
@@ -102,15 +109,15 @@ class TrainingFrame:
     def fluctuation(self) -> Tensor:
         """Scaled velocity fluctuation (v - <v>) d / u'^3, (n, 3); collective.
 
-        d is the filter width and u' the rms of one component of v - <v>. The scalar product with an acceleration is the
-        power in units of u'^3 / d.
+        <.> is the mean over all particles, d the filter width and u' the rms of one component of v - <v>. The scalar
+        product with an acceleration is the power in units of u'^3 / d.
         """
         velocity, comm = self.particles.velocity, self.decomposition.comm
         velocity = velocity - mean_over_ranks(comm, velocity)
         return velocity * (self.model.flow.scales.filter_width / root_mean_square(comm, velocity) ** 3)
 
     def rows(self, ids: np.ndarray) -> Tensor:
-        """Indices of those particles of this rank whose id is among `ids`."""
+        """Return the indices of those particles of this rank whose id is among `ids`."""
         wanted = torch.from_numpy(ids).to(self._sorted_ids.device)
         place = torch.searchsorted(self._sorted_ids, wanted)
         inside = place < len(self._sorted_ids)
@@ -124,7 +131,7 @@ class TrainingFrame:
 
     @torch.no_grad()
     def within(self, kernel: SmoothingKernel) -> KernelNeighborhood:
-        """Halo, neighbour list and volumes of the `averaged` particles within a kernel's support; collective.
+        """Return halo, neighbour list and volumes of the `averaged` particles for averages with a kernel; collective.
 
         The result is kept until another kernel is given.
         """
@@ -140,9 +147,10 @@ class TrainingFrame:
         return self._within
 
     def errors(self, rows: Tensor | None = None, density: Tensor | None = None) -> dict[str, Tensor]:
-        """Predicted minus true rates: "acceleration" (k, 3) and, if the model has it, "density_rate" (k,); collective.
+        """Return predicted minus true rates: "acceleration" (k, 3) and, if the model gives it, "density_rate" (k,).
 
-        The k particles are `rows` or all owned ones. `density` (n,) replaces the density that terms give.
+        Collective. The k particles are those with the indices `rows`, or all owned ones. `density` (n,) replaces the
+        density that terms give.
         """
         chosen = slice(None) if rows is None else rows
         rates = self.dynamics.rates(self.particles, rows, self.kept, density)
@@ -153,26 +161,29 @@ class TrainingFrame:
 
     @torch.no_grad()
     def seen(self) -> ParticleSet:
-        """This rank's particles. If terms of the model give a density, it replaces the stored one, because other terms
-        read it. Collective."""
+        """Return this rank's particles with the density that the terms of the model read; collective.
+
+        This is the density that other terms of the model give, or the stored density if no term gives one.
+        """
         rates = self.dynamics.rates(self.particles, self._row_of_sorted[:0], self.kept)
         return self.particles if rates.density is None else replace(self.particles, density=rates.density)
 
 
 class ForceTrainer:
-    """Trains a particle model, first on the trajectory and power losses, then also on the other losses of Eq. 15.
+    """Trains a particle model on single frames, either on the trajectory and power losses alone or on all losses.
 
-    Every step draws a frame. A step with the field loss also draws a cube of the box, and takes all particles in and
-    around the cube. Any other step draws `batch` particles by their ids. All draws depend on (seed, step) alone, so
-    that the loss is the same on any number of ranks.
+    Every step draws a frame at random. A step with the field loss also draws a cube of the box, and takes all particles
+    in and around the cube. Any other step draws `batch` particles by their ids. All draws depend on (seed, step) alone,
+    so that the loss is the same on any number of ranks.
 
     Parameters
     ----------
     model, frames : the model and the training frames, all on the same slabs.
     kernel : kernel of the field loss; None without this loss. The loss is evaluated at the points of the filtered
-        field or, if frames have none, on a grid with about as many points as there are particles.
+        velocity or, if frames have none, on a grid with about as many points as there are particles.
     weights : weights of the losses.
     batch : number of particles in a step without the field loss.
+    seed : seed of all random draws.
     """
 
     def __init__(self, model: LagrangianModel, frames: Sequence[TrainingFrame], kernel: SmoothingKernel | None,
@@ -186,26 +197,28 @@ class ForceTrainer:
                         else later.points)
 
     def trajectory_step(self, optimizer: Adam, step: int) -> dict[str, float]:
-        """One optimiser step on the trajectory loss (Eq. 12) and the power loss of a random batch.
+        """Take an optimiser step on the trajectory loss (Eq. 12) and the power loss of a random batch of particles.
 
-        Returns a dict: "loss", the weighted sum; each unweighted loss, such as "power_loss"; and "gradient_norm".
+        Return, by name, "loss", the weighted sum of the losses; each unweighted loss, such as "power_loss"; and
+        "gradient_norm".
         """
         frame, random = self._drawn(step)
         rows = frame.rows(random.choice(self.total, self.batch, replace=False))
         return self._step(optimizer, self._one_step_shares(frame, rows, frame.errors(rows), self.batch))
 
     def combined_step(self, optimizer: Adam, step: int) -> dict[str, float]:
-        """One optimiser step on all losses, in a random cube if there is a field loss, else on a random batch.
+        """Take an optimiser step on all losses, in a random cube if there is a field loss, else on a random batch.
 
-        Returns the same numbers as `trajectory_step`, for all losses.
+        Return the same numbers as `trajectory_step`, for all losses.
         """
         return self._step(optimizer, self._combined_shares(*self._drawn(step)))
 
     @torch.no_grad()
     def one_step_error(self, frame: TrainingFrame, most: int) -> float:
-        """Normalised L2 error of the acceleration on a fixed sample of at most `most` particles of a frame; collective.
+        """Return the normalised L2 error of the acceleration on a fixed sample of particles of a frame; collective.
 
-        With a power loss, the result is the root of a sum: the squared error plus the weighted power loss.
+        The sample has at most `most` particles. With a power loss, the result is the square root of the squared error
+        plus the weighted power loss.
         """
         count = min(most, self.total)
         rows = frame.rows(np.random.default_rng(self.seed).choice(self.total, count, replace=False))
@@ -218,18 +231,24 @@ class ForceTrainer:
 
     @torch.no_grad()
     def combined_error(self, frame: TrainingFrame, draws: int) -> float:
-        """Root of the mean, over fixed random draws, of the weighted sum of all losses on one frame; collective."""
+        """Return the square root of the weighted sum of all losses on a frame; collective.
+
+        The sum is a mean over random cubes or batches, `draws` in number, which are the same in every call.
+        """
         shares = [self._weighted(self._combined_shares(frame, np.random.default_rng([self.seed, draw])))
                   for draw in range(draws)]
         return float(shared_values(self.comm, {"loss": sum(shares)})["loss"] / draws) ** 0.5
 
     def _drawn(self, step: int) -> tuple[TrainingFrame, np.random.Generator]:
-        """The frame of a step, and the generator that draws its particles."""
+        """Return the frame of a step, and the random generator that then draws the particles."""
         random = np.random.default_rng([self.seed, step])
         return self.frames[random.integers(len(self.frames))], random
 
     def _combined_shares(self, frame: TrainingFrame, random: np.random.Generator) -> dict[str, Tensor]:
-        """This rank's shares of all losses, unweighted."""
+        """Return this rank's shares of all losses on a frame by name, without their weights.
+
+        `random` draws the cube or the batch.
+        """
         if self.weights.field > 0:
             corner, side, reach = random.uniform(0, self.length, 3), self.length / 4, self.kernel.support
             rows = self._in_cube(frame.averaged.position, corner - reach, side + 2 * reach)
@@ -255,11 +274,12 @@ class ForceTrainer:
 
     def _one_step_shares(self, frame: TrainingFrame, rows: Tensor, errors: dict[str, Tensor],
                          count: int) -> dict[str, Tensor]:
-        """This rank's shares of the trajectory loss and the power loss, over `count` particles of all ranks.
+        """Return this rank's shares of the trajectory loss and the power loss, which are means over `count` particles.
 
-        The trajectory loss is Eq. 12 with centred differences. Each rate is divided by its rms in the frame, so that
-        all frames of a decaying flow count alike. A learned density rate is part of the trajectory loss, unless a term
-        of this rate is learned through several steps of the simulation.
+        `rows` are the indices of those particles that this rank owns, and `errors` are their errors. The trajectory loss
+        is Eq. 12 with centred differences of the velocity as the true acceleration. Each rate is divided by its rms in
+        the frame, so that all frames of a decaying flow count alike. A learned density rate is part of the trajectory
+        loss, unless a term of this rate is learned through several steps of the simulation.
         """
         share = mean_square_share(errors["acceleration"], frame.acceleration_rms, count)
         if self.model.regresses_density:
@@ -270,28 +290,31 @@ class ForceTrainer:
         return shares
 
     def _power_share(self, frame: TrainingFrame, rows: Tensor, error: Tensor, count: int) -> Tensor:
-        """This rank's share of the squared error of the power, ((d / u'^3) <(v - <v>) . (a - a_true)>)^2.
+        """Return this rank's share of the power loss ((d / u'^3) <(v - <v>) . (a - a_true)>)^2.
 
-        <.> is the mean over particles. A model fitted to accelerations alone drains too little energy: its features are
-        noisy, which attenuates the coefficients of the regression.
+        It is the squared error of the power of the forces, in the units of `TrainingFrame.fluctuation`. <.> is the mean
+        over particles. Without this loss, a model takes too little energy from the flow, because noise in its inputs
+        makes the fitted coefficients too small.
         """
         power = sum_over_ranks(self.comm, (frame.fluctuation[rows].to(error) * error).sum()[None] / count)
         return power.square().sum() / self.comm.size  # every rank has the whole, so its share is an equal part
 
     def _field_share(self, frame: TrainingFrame, rows: Tensor, error: Tensor, inside: Tensor) -> Tensor:
-        """This rank's share of Eq. 13 with errors divided by the time step, in units of the mean square acceleration.
+        """Return this rank's share of Eq. 13: the mean square of an error of the kernel average <.> at grid points.
 
-        The mean is over the grid points `inside` of all ranks. <.> is the kernel average.
+        The error of the velocity is divided by the time step and by the rms acceleration. The mean is over the grid
+        points of all ranks with the indices `inside`. `rows` are the indices of the particles whose accelerations a
+        were predicted, and `error` (k, 3) is a - a_true.
 
-        Without a filtered field, the error is <a - a_true> at the true positions. The kernel averages the predicted and
-        the true velocity one step ahead, so its own error cancels. That error is far larger than the change of velocity
-        in a step, and the force cannot correct it.
+        Without a filtered velocity, the error is <a - a_true> at the true positions. Here the predicted velocity after
+        a step is compared with the true one, both averaged by the kernel, so the error of the kernel cancels. This
+        error is far larger than the change of velocity in a step, and the force cannot correct it.
 
-        With a filtered field u one frame later, the error is (<v> - u) / span. v = v_before + span a is the model's
+        With a filtered velocity u one frame later, the error is (<v> - u) / span. v = v_before + span a is the model's
         velocity after a midpoint step of length span, from the frame before to the frame after. True accelerations are
-        centred differences, so v is the true velocity v_true at the end of the step plus span (a - a_true). The
-        positions there are the true ones, because they do not depend on a. The error is therefore <a - a_true> plus the
-        kernel's own error, (<v_true> - u) / span.
+        centred differences, so v = v_true + span (a - a_true), where v_true is the true velocity in the frame after.
+        The positions at the end of the step are the true ones, because a midpoint step computes them from the velocity in
+        its middle, not from a. The error is therefore <a - a_true> plus the error of the kernel, (<v_true> - u) / span.
         """
         within, later, points = frame.within(self.kernel), frame.later, self._points[inside]
         change = torch.zeros_like(frame.acceleration).index_add(0, rows, error)
@@ -308,9 +331,9 @@ class ForceTrainer:
         return mean_square_share(field, frame.acceleration_rms, max(count, 1))
 
     def _divergence_shares(self, frame: TrainingFrame, rows: Tensor, error: Tensor) -> dict[str, Tensor]:
-        """This rank's shares of Eq. 14 for acceleration and velocity, each with all components in one histogram.
+        """Return this rank's shares of Eq. 14 for acceleration and velocity, each with all components in one histogram.
 
-        The predicted velocity is the true one plus the error of the acceleration times v_rms / a_rms.
+        The predicted velocity is the true velocity plus (v_rms / a_rms) times the error of the acceleration.
         """
         shares, truth = {}, frame.acceleration[rows]
         if self.weights.acceleration_kl > 0:
@@ -328,6 +351,9 @@ class ForceTrainer:
         return kullback_leibler(expected, predicted) / self.comm.size
 
     def _in_cube(self, points: Tensor, corner: np.ndarray, side: float) -> Tensor:
-        """Indices of those points (m, 3) that lie in a cube. The cube may extend across faces of the periodic box."""
+        """Return the indices of those points (m, 3) that lie in a cube with this lowest `corner` and this `side`.
+
+        The cube may extend across faces of the periodic box.
+        """
         offset = (points - torch.from_numpy(corner).to(points.device)) % self.length
         return torch.nonzero((offset < side).all(1)).squeeze(1)

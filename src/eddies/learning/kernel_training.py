@@ -22,7 +22,8 @@ class KernelSample:
     field, gradient : filtered velocity (m, 3) and its gradient (m, 3, 3) [component, direction] at the m grid points
         of the slab, z slowest.
 
-    `mean_square` holds the mean squares of one component of the velocity and of the gradient, over the whole grid.
+    `mean_square` holds two numbers: the mean square of a component of the filtered velocity over the whole grid, and
+    that of a component of its gradient. The constructor and `errors_of` are collective.
     """
 
     def __init__(self, particles: ParticleField, field: Tensor, gradient: Tensor) -> None:
@@ -31,13 +32,16 @@ class KernelSample:
         self.mean_square = self._mean_squares(self.field, self.gradient)
 
     def own_rows(self, points: np.ndarray) -> Tensor:
-        """Rows in `field` of those `points` that this slab holds; `points` are indices in the whole grid, z slowest."""
+        """Return the rows in `field` of those `points` that lie in this slab.
+
+        `points` are indices in the whole grid, z slowest.
+        """
         n = self.decomposition.planes
         own = points[(points // n**2 >= self.decomposition.start) & (points // n**2 < self.decomposition.stop)]
         return torch.from_numpy(own - self.decomposition.start * n**2)
 
     def errors_of(self, velocity: Tensor, gradient: Tensor) -> tuple[float, float]:
-        """Normalised L2 errors of a velocity (m, 3) and gradient (m, 3, 3) over the whole grid; collective."""
+        """Return the normalised L2 errors, over the whole grid, of a velocity (m, 3) and a gradient (m, 3, 3)."""
         squares = self._mean_squares(velocity - self.field, gradient - self.gradient)
         return tuple(np.sqrt(np.array(squares) / self.mean_square))
 
@@ -49,14 +53,15 @@ class KernelSample:
 class KernelTrainer:
     """Fits a kernel network to samples. Each step lowers the loss of Eq. 8 on random grid points of one sample.
 
-    Points are drawn from (seed, step) alone, so that the loss is the same on any number of ranks.
+    The sample and the points depend on (seed, step) alone, so that the loss is the same on any number of ranks.
 
     Parameters
     ----------
     network : the kernel.
-    samples : the fields to which it is fitted.
-    gradient_weight, normalization_weight : weights of these losses in Eq. 8; the velocity loss has weight 1.
-    points : number of random grid points per step, at most all points of the grid.
+    samples : the fields to which the kernel is fitted.
+    gradient_weight, normalization_weight : weights of the gradient loss and of the normalisation loss in Eq. 8; the
+        velocity loss has weight 1.
+    points : number of random grid points per step; all points are taken if the grid has fewer.
     seed : seed of the random choice of samples and points.
     """
 
@@ -68,7 +73,10 @@ class KernelTrainer:
         self.points, self.seed = min(points, self.total), seed
 
     def step(self, optimizer: Adam, step: int) -> dict[str, float]:
-        """One step. Returns by name the weighted sum "loss", each unweighted global loss, and "gradient_norm"."""
+        """Take an optimiser step; collective.
+
+        Return, by name, "loss", the weighted sum of the losses; each unweighted loss; and "gradient_norm".
+        """
         random = np.random.default_rng([self.seed, step])
         sample = self.samples[random.integers(len(self.samples))]
         rows = sample.own_rows(np.sort(random.choice(self.total, self.points, replace=False)))

@@ -15,10 +15,10 @@ from eddies.parallel.reduction import global_sum, sum_flat
 
 
 class Adam:
-    """Adam (Kingma and Ba 2014) with a learning rate that falls geometrically over `steps` steps.
+    """The optimiser Adam (Kingma and Ba 2014). The learning rate falls geometrically over `steps` steps.
 
-    The loss given to `step` is this rank's share of the global loss. Gradients are summed over ranks in one message, so
-    that all ranks, also those without particles, take the same step.
+    It falls from `first_rate` to `last_rate`. The global loss is the sum of the shares of all ranks. Gradients are
+    summed over ranks in one message, so that all ranks, also those without particles, take the same step.
     """
 
     def __init__(self, comm: Comm, parameters: Iterable[nn.Parameter], steps: int, first_rate: float,
@@ -32,11 +32,11 @@ class Adam:
 
     @property
     def learning_rate(self) -> float:
-        """Rate of the next step."""
+        """Learning rate of the next step."""
         return self.first_rate * (self.last_rate / self.first_rate) ** (self.taken / max(self.steps - 1, 1))
 
     def step(self, share: Tensor) -> float:
-        """One step down the gradient of the sum of all shares; returns the norm of that gradient."""
+        """Take a step, given this rank's share of the global loss, and return the norm of the global gradient."""
         for parameter in self.parameters:
             parameter.grad = None
         if share.requires_grad:  # otherwise no parameter affects this rank's share
@@ -48,7 +48,7 @@ class Adam:
         for gradient, summed in zip(gradients, on_host):
             gradient.copy_(summed)
         norm = float(sum(gradient.double().square().sum() for gradient in on_host) ** 0.5)
-        steps = [torch.tensor(float(self.taken)) for _ in self.parameters]  # `adam` counts them up
+        steps = [torch.tensor(float(self.taken)) for _ in self.parameters]  # `adam` adds 1 to each
         with torch.no_grad():
             adam(self.parameters, gradients, *self._moments.values(), [], steps, amsgrad=False, beta1=0.9,
                  beta2=0.999, lr=self.learning_rate, weight_decay=0.0, eps=1e-8, maximize=False)
@@ -56,13 +56,13 @@ class Adam:
         return norm
 
     def state_dict(self) -> dict[str, int | np.ndarray]:
-        """The state besides the parameters: number of steps taken and running means, equal on all ranks."""
+        """Return the number of steps taken and the running means, for a checkpoint; they are equal on all ranks."""
         means = {f"{name}_{number}": mean.cpu().numpy() for name, means in self._moments.items()
                  for number, mean in enumerate(means)}
         return {"taken": self.taken, **means}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Inverse of `state_dict`."""
+        """Restore a state from `state_dict`."""
         self.taken = state["taken"]
         for name, means in self._moments.items():
             for number, mean in enumerate(means):
@@ -70,6 +70,6 @@ class Adam:
 
 
 def shared_values(comm: Comm, shares: Mapping[str, Tensor]) -> dict[str, float]:
-    """The global losses by name: sums of the shares of all ranks, in one message."""
-    own = np.array([float(share.detach()) for share in shares.values()])  # they may be on different devices
+    """Return, for each name, the sum of the shares of all ranks. One message carries all of them."""
+    own = np.array([float(share.detach()) for share in shares.values()])  # shares may be on different devices
     return dict(zip(shares, global_sum(comm, own).tolist()))

@@ -20,7 +20,7 @@ from eddies.particles.integrators import Integrator
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
 
-# Lower bound of a band's mean energy decay, as a share of the largest decay. Smaller decays are raised to this bound.
+# Lower bound of the typical energy change of a band (see `mean_losses`), as a share of the largest change of any band.
 SLOWEST = 0.1
 
 
@@ -31,9 +31,10 @@ class TrainingWindow:
     Parameters
     ----------
     particles : the particles at the start.
-    velocity, density : true values (frames, n, 3) and (frames, n) at the end of frame intervals 1, 2, ...; rows as in
-        `particles`; the density may be None.
-    energies : (frames + 1, bands), true kinetic energy by bands of wavenumbers, from the start on; or None.
+    velocity, density : true values (frames, n, 3) and (frames, n) at the end of frame intervals 1, 2, ...; rows are as
+        in `particles`. The density may be None.
+    energies : true kinetic energy (frames + 1, bands) in bands of wavenumbers, at the start and at the end of each
+        frame interval; None without the energy loss.
     """
 
     particles: ParticleSet
@@ -45,25 +46,28 @@ class TrainingWindow:
 class RolloutTrainer:
     """Trains a model on rollouts from true initial states.
 
-    Every step draws a window from (seed, step) and advances all its particles by the integrator of the simulation. The
-    loss of frame k is <|v - v_true|^2> / <|v_true - v_start|^2>. It is 1 for particles without acceleration, so all
-    frames count alike. A density whose rate is learned has a loss of the same form.
+    Every training step draws one window at random, which depends on (seed, step) alone, and advances all particles of
+    the window by the integrator of the simulation. The loss of a frame is <|v - v_true|^2> / <|v_true - v_start|^2>,
+    with means <.> over all particles. It is 1 for particles without acceleration, so all frames count alike. A density
+    whose rate is learned has a loss of the same form.
 
     The energy loss is the squared error of the kinetic energy in a band of wavenumbers, averaged over the bands. The
-    error is in units of the energy that the band loses on average from the start to the frame. Fitted forces are
-    attenuated where their features are noisy: they take too much energy from some scales and too little from others.
-    The error of the velocity hardly shows this.
+    error is in units of the energy that the band loses on average from the start to the frame. This loss is needed
+    because noise in the inputs makes fitted forces too weak. Such forces take too much energy from some scales and too
+    little from others, and the error of the velocity hardly shows this.
 
-    The gradient goes through all steps: force, neighbours, halo, and the grid of the resolved velocity. The backward
-    pass computes each step again, so that memory holds the intermediate results of only one step.
+    The gradient is that of the whole rollout. It goes through the forces of all steps, the distances of neighbours, the
+    halo, and the grid of the resolved velocity. The backward pass computes each step again, so that memory holds the
+    intermediate results of only one step.
 
     Parameters
     ----------
-    integrator : advances the particles; its dynamics must have `fixed_ranks`.
-    windows : true trajectories, on the slabs of the dynamics.
-    frame_interval, steps_per_frame : time between frames, and number of time steps in it.
+    integrator : advances the particles. Its dynamics must have `fixed_ranks`.
+    windows : true trajectories of the particles in this rank's slab.
+    frame_interval, steps_per_frame : time between frames, and number of time steps in this time.
     energy_weight : weight of the energy loss; if it is zero, windows need no energies.
-    resolution : computes the band energies of particles; unused if the weight is zero.
+    resolution : computes the band energies of particles; unused if `energy_weight` is zero.
+    seed : seed of the random choice of windows.
     stationary : whether the flow is forced, so that its bands lose no energy on average. The unit of the energy loss is
         then the rms change of a band's energy.
     """
@@ -78,9 +82,9 @@ class RolloutTrainer:
         self.losses = mean_losses(windows, stationary) if energy_weight > 0 else None
 
     def step(self, optimizer: Adam, step: int, horizon: int) -> dict[str, float]:
-        """One optimiser step on the first `horizon` frames of a random window.
+        """Take an optimiser step on the first `horizon` frames of a random window.
 
-        Returns the sum "loss", the losses of `loss_shares` by name, and "gradient_norm".
+        Return, by name, "loss", the sum of the losses; each loss of `loss_shares`; and "gradient_norm".
         """
         random = np.random.default_rng([self.seed, step])
         window = self.windows[random.integers(len(self.windows))]
@@ -91,7 +95,11 @@ class RolloutTrainer:
         return {"loss": sum(values.values()), **values, "gradient_norm": norm}
 
     def loss_shares(self, window: TrainingWindow, horizon: int) -> dict[str, Tensor]:
-        """This rank's weighted shares of "rollout_loss" and, if used, "energy_loss" for a window; collective."""
+        """Return this rank's shares of "rollout_loss" and, if it is used, "energy_loss"; collective.
+
+        A loss is the mean over the first `horizon` frames of the window. The energy loss includes its weight. The sum
+        of the shares of all ranks is the loss.
+        """
         shares: dict[str, list[Tensor]] = {"rollout_loss": []}
         for reached, particles in self._frames(window.particles, horizon):
             shares["rollout_loss"] += [mean_square_share(error, root_mean_square(self.comm, change), self.total)
@@ -103,14 +111,20 @@ class RolloutTrainer:
 
     @torch.no_grad()
     def validation_error(self, window: TrainingWindow, horizon: int) -> float:
-        """Root of the loss of a window; without the energy loss it is 1 for particles without acceleration."""
+        """Return the square root of the summed losses of the first `horizon` frames of a window; collective.
+
+        With the loss of the velocity alone, it is 1 for particles without acceleration.
+        """
         shares = self.loss_shares(window, horizon)
         return sum(shared_values(self.comm, shares).values()) ** 0.5
 
     def _energy_share(self, window: TrainingWindow, frame: int, particles: ParticleSet) -> Tensor:
-        """This rank's share, an equal part, of the mean squared error of the energies of the bands."""
+        """Return this rank's share of the energy loss of a frame, without its weight.
+
+        Every rank computes the whole loss, so the shares are equal parts.
+        """
         # The solve for the resolved velocity starts from zero, as for the true energies: a prediction would change the
-        # energies. In the backward pass the solve starts from its own solution and takes no iteration.
+        # energies. In the backward pass the solve starts from the solution of the forward pass and takes no iteration.
         near: Tensor | None = None
 
         def energies_of(position: Tensor, velocity: Tensor) -> Tensor:
@@ -125,7 +139,7 @@ class RolloutTrainer:
         return ((energies - true) / (true * self.losses * (frame + 1))).square().mean() / self.comm.size
 
     def _frames(self, particles: ParticleSet, horizon: int) -> Iterator[tuple[int, ParticleSet]]:
-        """Yield the number and the particles of each frame that the rollout reaches."""
+        """Yield the number, from 0 on, and the particles of each frame that the rollout reaches."""
         memory: dict[str, Tensor] = {}
         self.integrator.dynamics.begin()
         for reached in range(horizon):
@@ -134,13 +148,17 @@ class RolloutTrainer:
             yield reached, particles
 
     def _advanced(self, particles: ParticleSet, memory: dict[str, Tensor]) -> tuple[ParticleSet, dict[str, Tensor]]:
-        """The particles and the integrator's memory after one time step. The backward pass computes the step again."""
+        """Return the particles and the integrator's memory after one time step.
+
+        The backward pass computes the step again.
+        """
         given, carried, after = particles.columns(), list(memory), ([], [])
         state = self.integrator.dynamics.state_dict()
         del given["id"]
 
         def advance(*columns: Tensor) -> tuple[Tensor, ...]:
-            # A new neighbour list and restored predictions: the backward pass then repeats the step exactly.
+            # The neighbour list is rebuilt and the predictions are restored, so that the backward pass repeats the
+            # step exactly.
             self.integrator.dynamics.forget()
             self.integrator.dynamics.load_state_dict(state)
             start = ParticleSet(particles.id, **dict(zip(given, columns)))
@@ -156,9 +174,9 @@ class RolloutTrainer:
 
     def _errors(self, window: TrainingWindow, frame: int,
                 particles: ParticleSet) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield the error of the velocity and its true change since the start of the window.
+        """Yield the error (n, 3) of the velocity, and the true change (n, 3) of the velocity since the window's start.
 
-        If the model learns the rate of the density, yield the same for the density.
+        If the model learns the rate of the density, also yield the error (n,) and the true change (n,) of the density.
         """
         true = window.velocity[frame]
         yield particles.velocity - true, true - window.particles.velocity
@@ -172,9 +190,10 @@ UNWRAPPED = getattr(checkpoint, "__wrapped__", checkpoint)
 
 
 def mean_losses(windows: Sequence[TrainingWindow], stationary: bool = False) -> Tensor:
-    """Typical change of ln(energy) per frame in each band (bands,), at least SLOWEST times that of the fastest band.
+    """Return the typical change of ln(energy) in a frame interval for each band of wavenumbers, (bands,).
 
-    The change is the absolute value of the mean over windows, or the rms over windows if `stationary`.
+    The change is the absolute value of the mean over windows, or the rms over windows if `stationary`. Changes below
+    SLOWEST times the largest change of any band are raised to this bound.
     """
     changes = torch.stack([window.energies[-1] / window.energies[0] for window in windows]).log()
     change = changes.square().mean(0).sqrt() if stationary else changes.mean(0)
@@ -183,7 +202,7 @@ def mean_losses(windows: Sequence[TrainingWindow], stationary: bool = False) -> 
 
 
 def _recomputed(function: Callable[..., Any], *columns: Tensor) -> Any:
-    """Return function(*columns). Its intermediate results are not stored: the backward pass calls it again."""
+    """Return function(*columns) without storing intermediate results: the backward pass calls the function again."""
     if not torch.is_grad_enabled():
         return function(*columns)
     return UNWRAPPED(function, *columns, use_reentrant=False, preserve_rng_state=False)

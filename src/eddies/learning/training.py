@@ -1,4 +1,4 @@
-"""The course of a training: phases of descent, validation, the best state, and the state for a checkpoint."""
+"""The course of a training: its phases, validation, the best state of the model, and the state for a checkpoint."""
 
 from __future__ import annotations
 
@@ -18,18 +18,20 @@ from eddies.parallel.halo import HaloError
 
 @dataclass(frozen=True)
 class Phase:
-    """Steps of a training with one decay of the learning rate and one measure of the validation error.
+    """A part of a training, with its own decay of the learning rate and its own validation error.
 
     Parameters
     ----------
     name : name in the progress line.
-    work : (steps,), cost of each optimiser step in a unit common to all phases, to estimate the time left.
+    work : cost (steps,) of each optimiser step, in a unit that all phases share. The time left is estimated from it.
     rates : learning rate of the first and of the last step.
-    take : takes an optimiser step, given the optimiser and the step's number in the phase; returns losses by name.
-    validate : returns the error on held-out data. The phase ends with the state of least error; if `validate` is
-        None, with the last state.
-    validate_every : steps between two validations; the last step is validated too.
-    patience : the phase ends after this many steps without a smaller validation error; if None, after all steps.
+    take : function of the optimiser and the step's number in the phase. It takes an optimiser step and returns numbers
+        by name, among them "loss" and "gradient_norm".
+    validate : function that returns the error on held-out data. The phase ends with the state of the model that has the
+        smallest error. If `validate` is None, it ends with the last state.
+    validate_every : number of steps from one validation to the next; there is also one after the last step.
+    patience : the phase ends after this many steps without a smaller validation error. If it is None, all steps are
+        taken.
     """
 
     name: str
@@ -53,11 +55,11 @@ class TrainingDiverged(ValueError):
 class Training:
     """Trains a model in phases, one after the other. Each phase has at least one step.
 
-    A validated phase ends with its state of least error, which may be the state before its first step. All ranks hold
-    the same state.
+    A phase with validation ends with the state of the model that has the smallest error. This may be the state before
+    the first step. All ranks hold the same state.
 
-    `history` has a row of numbers by name for each step. The first row of a validated phase has `start_error`, the
-    validation error before the step.
+    `history` has for each step a row, a dict of numbers. In a phase with validation, the first row has `start_error`,
+    the validation error before the step.
     """
 
     def __init__(self, comm: Comm, model: nn.Module, phases: Sequence[Phase]) -> None:
@@ -101,7 +103,7 @@ class Training:
         return float(done / sum(phase.work.sum() for phase in self.phases))
 
     def step(self) -> None:
-        """One step of the current phase, and a validation if one is due."""
+        """Take a step of the current phase, and validate if a validation is due."""
         phase, rate = self.phase, self.optimizer.learning_rate
         start = {"start_error": self._error_of(phase.validate)} if phase.validate and self.optimizer.taken == 0 else {}
         row = {"phase": float(self.phase_number), "step": float(self.steps), "learning_rate": rate, **start,
@@ -125,9 +127,10 @@ class Training:
 
     @property
     def cost(self) -> list[dict[str, Any]]:
-        """A row for each finished phase: `phase`, its name; `steps`; wall `seconds` including validations; and `error`.
+        """A row for each finished phase, with its name `phase`, its number of `steps`, its `seconds` and its `error`.
 
-        The error is the validation error of the weights at the end of the phase; None without validation.
+        `seconds` is wall time and includes validations. `error` is the validation error of the model at the end of the
+        phase; None without validation.
         """
         finished, before = [], 0.0
         for number, phase in enumerate(self.phases[:self.phase_number]):
@@ -139,12 +142,12 @@ class Training:
         return finished
 
     def columns(self) -> dict[str, np.ndarray]:
-        """The history as arrays (steps,) by name; NaN at steps that have no such number."""
+        """Return the history as arrays (steps,) by name. They are NaN at steps whose row lacks the name."""
         names = sorted({name for row in self.history for name in row})
         return {name: np.array([row.get(name, np.nan) for row in self.history]) for name in names}
 
     def state_dict(self) -> dict[str, Any]:
-        """The whole state for a checkpoint: numbers and arrays by name."""
+        """Return the whole state of the training, for a checkpoint: numbers and arrays by name."""
         parts = {"model": self._weights(), "best": self.best, "history": self.columns(),
                  "optimizer": self.optimizer.state_dict()}
         return {"number": self.phase_number, "best_error": self.best_error, "best_at": self.best_at,
@@ -153,7 +156,7 @@ class Training:
                    for part, values in parts.items() for name, value in values.items()}}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Inverse of `state_dict`."""
+        """Restore a state from `state_dict`."""
         parts = {part: {name: state[f"{part} {name}"] for name in names} for part, names in state["names"].items()}
         self._load(parts["model"])
         self._begin(state["number"])
@@ -165,7 +168,10 @@ class Training:
         self._seconds_before = self.history[-1]["seconds"] if self.history else 0.0
 
     def _error_of(self, validate: Callable[[], float]) -> float:
-        """The validation error; infinite if it is not finite or a HaloError occurs. Stores the best state so far."""
+        """Return the validation error, and store the state of the model if no earlier error was as small.
+
+        The error is infinite if `validate` raises HaloError or returns a number that is not finite.
+        """
         try:
             error = validate()
         except HaloError:
