@@ -1,4 +1,4 @@
-"""The cross-checks of a scene: they find values that are allowed on their own, but not together.
+"""The cross-checks of a scene. They find values that are allowed on their own, but not together.
 
 The checks run when a scene is made. Each check compares some sections and yields its problems. A problem is a pair of
 the key at fault, "section.key", and a text with the reason and a remedy.
@@ -37,7 +37,8 @@ STARTS = dict.fromkeys(("training.window", "training.truths"), SAME_START)
 
 
 def check_names(name: str, seed: int, realisations: Sequence[int], has_rollouts: bool) -> Problems:
-    """Yield problems of the name, which must be valid for a directory, and of the seeds of realisations."""
+    """Yield a problem if the name of a scene cannot be that of a directory, or if seeds of realisations are not used,
+    repeated, or equal to the seed of the scene."""
     if not re.fullmatch(NAME, name):
         yield "name", ('must be the name of a directory: at most 100 letters, digits, ".", "_" and "-", the first a '
                        'letter or a digit; choose another, such as "my-run_2"')
@@ -64,7 +65,7 @@ def problem_of_name(variant: str) -> str:
 def check_foreign(paths: Iterable[tuple[str, str]]) -> Problems:
     """Yield a problem for each import path that cannot be loaded, or whose class does not fit its key.
 
-    `paths` are pairs (key, import path). Further checks of terms are in `Model`.
+    `paths` are pairs (key, import path). `Model` checks the classes of terms further.
     """
     for key, path in paths:
         try:
@@ -81,7 +82,8 @@ def check_foreign(paths: Iterable[tuple[str, str]]) -> Problems:
 
 
 def check_flow(flow: Flow, initial: Initial, forcing: Forcing | None, model: Model | None) -> Problems:
-    """Yield problems of the sound speed, of [initial], and of wavenumbers that the grid cannot resolve."""
+    """Yield a problem if the sound speed or a key of [initial] does not fit the flow, or if a wavenumber is too high
+    for the grid."""
     if flow.compressible and flow.sound_speed is None:
         yield "flow.sound_speed", "this key is missing; a compressible fluid needs a number above 0"
     if not flow.compressible and flow.sound_speed is not None:
@@ -109,7 +111,8 @@ def check_flow(flow: Flow, initial: Initial, forcing: Forcing | None, model: Mod
 
 def check_time(time: Time, flow: Flow, forcing: Forcing | None, spin_up: SpinUp | None,
                tracers: Tracers | None) -> Problems:
-    """Yield problems of the run time (missing or given twice), the stationary span, and forcing that never acts."""
+    """Yield a problem if the run time is missing or given twice, if the stationary span does not fit the flow or the
+    spin-up, or if forcing never acts or is missing."""
     if tracers is None and time.duration is None:
         yield "time.duration", "this key is missing; without [tracers] it is the run time, a number above 0"
     if tracers is not None and time.duration is not None:
@@ -147,8 +150,11 @@ def check_tracers(tracers: Tracers, flow: Flow, initial: Initial, variants: Coll
 
 def check_particles(tracers: Tracers, kernel: Kernel | None, model: Model | None, simulation: Simulation | None,
                     present: Collection[str]) -> Problems:
-    """Yield a problem if a scene with a kernel, a model or a rollout has tracers that follow the unfiltered velocity.
-    Yield a problem if the radius of neighbours plus the skin is at least half the edge of the cube."""
+    """Yield a problem if tracers follow the unfiltered velocity in a scene with a kernel, a model or a rollout, or if
+    the radius within which particles are neighbours, with the skin, is at least half the edge of the cube.
+
+    `present` holds the names of the sections that the scene has.
+    """
     made = [f"[{name}]" for name in ("kernel", "model", "training", "simulation") if name in present]
     if not tracers.filtered and made:
         yield "tracers.filtered", ("these particles follow the unfiltered velocity, but kernels, models and rollouts "
@@ -164,7 +170,11 @@ def check_particles(tracers: Tracers, kernel: Kernel | None, model: Model | None
 
 
 def check_needs(present: Collection[str], needs_model: bool, has_weights: bool) -> Problems:
-    """Yield a problem for each section that needs another one which is missing."""
+    """Yield a problem for each section that needs a section which the scene lacks.
+
+    `present` holds the names of the sections that the scene has. `needs_model` is true if the rollout needs a trained
+    model, `has_weights` if [model] path gives trained weights.
+    """
     needs = {"kernel": "tracers", "reconstruction": "tracers", "model": "tracers", "training": "model",
              "simulation": "model" if needs_model else "tracers"}
     for name, other in needs.items():
@@ -176,7 +186,9 @@ def check_needs(present: Collection[str], needs_model: bool, has_weights: bool) 
 
 
 def check_density(flow: Flow, model: Model | None, simulation: Simulation | None) -> Problems:
-    """Yield a problem if the density is given twice, given but not read, or read but not given by terms or the flow."""
+    """Yield a problem if terms give the density twice, if no term reads the density that a term gives, if no term gives
+    the density that a term reads, or if one term both reads and gives it. Yield a problem, too, if a term or the method
+    of the rollout needs the density of an incompressible flow."""
     incompressible, rates = not flow.compressible, {"density", "density_rate"}
     remedy = 'or set [flow] fluid = "compressible" and sound_speed'
     settings = model.settings if model else {}
@@ -208,7 +220,8 @@ def check_density(flow: Flow, model: Model | None, simulation: Simulation | None
 
 
 def check_training(training: Training, tracers: Tracers | None, kernel: Kernel | None) -> Problems:
-    """Yield a problem if steps, learning rates, frames or weights contradict each other."""
+    """Yield a problem if the numbers of steps, frames and particles, the learning rates or the weights of the training
+    contradict each other or other sections."""
     if training.combined_steps > training.steps:
         yield "training.combined_steps", (f"must be at most steps = {training.steps}, because the combined steps are "
                                           "the last of all steps; lower it")
@@ -240,9 +253,10 @@ def check_training(training: Training, tracers: Tracers | None, kernel: Kernel |
 
 
 def check_simulation(simulation: Simulation, tracers: Tracers, seen: float) -> Problems:
-    """Yield a problem if the frame interval is no multiple of the step or the tracers' interval, or `start` is missing.
+    """Yield a problem if the frame interval is not a multiple of the tracers' frame interval and, if the integrator
+    needs this, of the step. Yield a problem, too, if `start` is missing and training uses the whole ground truth.
 
-    `seen` is the fraction of the ground truth that training has used.
+    `seen` is the fraction of the ground truth that training uses.
     """
     step, frame_interval = simulation.longest_step, simulation.frame_interval
     if not (simulation.scheme.dense or math.isinf(step) or _is_multiple(frame_interval, step)):
@@ -259,10 +273,11 @@ def check_simulation(simulation: Simulation, tracers: Tracers, seen: float) -> P
 
 
 def check_coarse_grid(eulerian: Eulerian | None, cells: int, flow: Flow, model: Model | None) -> Problems:
-    """Yield a problem if [eulerian] is not used, its grid is too fine, or a sound speed or damping rates are missing.
+    """Yield a problem if [eulerian] is not used, if its grid is too fine, or if the sound speed or the damping rates
+    that it needs are missing.
 
-    `cells` is the number of cells along a side of this grid, 0 if the rollout uses none. It may exceed that of the flow
-    only with start = "particles".
+    `cells` is the number of cells along a side of this grid; 0 if the rollout has no such grid. It may exceed the
+    number of cells of the flow only with start = "particles".
     """
     if eulerian is None:
         eulerian = Eulerian()

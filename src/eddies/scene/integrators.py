@@ -1,8 +1,9 @@
-"""The time stepping schemes of particles: cost and stability of a step. This module does not need torch."""
+"""The time stepping schemes of particles, with the cost and the stability of their steps. This module does not need
+torch."""
 
 from dataclasses import dataclass
 
-#: The largest stable Courant number of ETDRK4, with which the search for the step of a coarse grid begins.
+#: The largest stable Courant number of ETDRK4. The search for the time step of a coarse grid begins with it.
 MOST_COURANT = 1.4
 
 
@@ -10,17 +11,19 @@ MOST_COURANT = 1.4
 class Scheme:
     """A time stepping scheme that a scene can name.
 
-    `nodes` and `weights` are the coefficients c and b of a Runge-Kutta scheme; other schemes have none. Each stage
-    starts at the beginning of the step and uses the rates of the stage before. For `angle` and `iterations` see
-    docs/closure.md.
+    `nodes` and `weights` are the coefficients c and b of a Runge-Kutta scheme; other schemes have none. Each of its
+    stages starts at the beginning of the step and uses only the rates of the stage before. For `angle` and `iterations`
+    see docs/closure.md.
     """
 
     name: str
     evaluations: int  # number of evaluations of the rates in a step
     dense: bool = True  # whether it can interpolate between steps; otherwise frames lie at the ends of steps
-    angle: float  # largest k_c u' dt at which a velocity resolved up to k_c follows the flow
+    # Largest k_c u' dt with which the resolved velocity follows the flow. k_c: highest resolved wavenumber, u': rms of
+    # a component of the velocity, dt: time step.
+    angle: float
     decay: float  # largest stable product of relaxation rate and time step
-    iterations: float  # typical number in a solve for the resolved velocity, with about the longest step
+    iterations: float  # typical number of iterations to solve for the resolved velocity, with about the longest step
     nodes: tuple[float, ...] = ()
     weights: tuple[float, ...] = ()
 
@@ -29,7 +32,8 @@ SCHEMES = {scheme.name: scheme for scheme in (
     Scheme(name="verlet", evaluations=1, dense=False, angle=0.5, decay=1.0, iterations=1.0),
     Scheme(name="corrected-verlet", evaluations=2, angle=0.5, decay=2.0, iterations=1.0),
     Scheme(name="rk2", evaluations=2, angle=1.2, decay=2.0, iterations=1.2, nodes=(0, 1 / 2), weights=(0, 1)),
-    # Heun's scheme: its stages are a third of a step apart, which suits a solve that starts from an extrapolation.
+    # Heun's scheme. Its stages are a third of a step apart. Equal distances suit the forecast from which each solve for
+    # the resolved velocity starts.
     Scheme(name="rk3", evaluations=3, angle=1.2, decay=2.51, iterations=3.0, nodes=(0, 1 / 3, 2 / 3),
            weights=(1 / 4, 0, 3 / 4)),
     Scheme(name="rk4", evaluations=4, angle=1.6, decay=2.78, iterations=6.5, nodes=(0, 1 / 2, 1 / 2, 1),

@@ -1,4 +1,4 @@
-"""The layers of a scene: its base, its own file, a variant, the command line.
+"""The layers of a scene: its base, its own file, a variant, and the command line.
 
 Each layer changes the keys of a TOML document in the same way: first it removes some keys or sections, then it sets
 others. The order is base, scene, variant, command line.
@@ -24,7 +24,7 @@ VARIANT = "variant"
 FILE_ONLY_KEYS = ("base", "unset")  # keys that only a file may have
 FILE_KEYS = {"initial": ("path",), "tracks": ("path",), "model": ("path",), "training": ("truths",),
              "simulation": ("step_from", "confirmed_on")}
-OF_VARIANTS = ("model", "training", "simulation", "eulerian")  # sections that a scene with variants does not use itself
+OF_VARIANTS = ("model", "training", "simulation", "eulerian")  # sections that only the variants of a scene use, if any
 DEEPEST = 3  # largest number of parts of a key, as in section.sub.key; [variant.NAME] adds two
 
 Document = dict[str, Any]
@@ -90,7 +90,10 @@ class Layer:
 
 
 def dotted(table: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield a pair of dotted key and value for each value in nested tables; an empty table counts as a value."""
+    """Yield (dotted key, value) for each value in a table and its inner tables; an empty table counts as a value.
+
+    `within` is the dotted name of the table; empty for the whole document.
+    """
     for name, value in table.items():
         key = f"{within}.{name}" if within else name
         if isinstance(value, dict) and value:
@@ -105,10 +108,11 @@ def with_sections(key: str) -> Iterator[str]:
 
 
 def read_document(name_or_path: str, above: Sequence[Path] = ()) -> tuple[Path, Document]:
-    """Return the path of a scene's file, and the scene's document: that of its base, if any, changed by this file.
+    """Return the path of a scene's file, and the document of the scene.
 
-    `above` holds the files of the scenes that have this one as a base. Variants of a scene replace those of its base.
-    Raises SceneError if there is no such scene, a file is not TOML, or a scene is its own base.
+    If the scene has a base, its document is that of the base with the changes in the file. If the file has variants,
+    they replace those of the base. `above` holds the files of the scenes that have this one as a base, directly or
+    through others. Raises SceneError if there is no such scene, a file is not TOML, or a scene is its own base.
     """
     path = _find(name_or_path, above[-1].parent if above else None)
     try:
@@ -160,7 +164,8 @@ def _find(name_or_path: str, beside: Path | None) -> Path:
 
 
 def _find_files(document: Document, folder: Path) -> None:
-    """Make relative paths absolute if their files exist beside the scene but not in the working directory."""
+    """Make the relative paths in a document absolute if their files exist in `folder`, the folder of the scene, but not
+    in the working directory."""
     def found(path: str) -> str:
         beside = os.path.abspath(folder / path)
         return beside if not os.path.exists(path) and os.path.exists(beside) else path
@@ -177,7 +182,7 @@ def _find_files(document: Document, folder: Path) -> None:
 
 
 def _parse(path: Path) -> Document:
-    """The tables and keys of a TOML file. Raises SceneError, with the line at fault, if it cannot be read."""
+    """Return the tables and keys of a TOML file. Raises SceneError, with the line at fault, if it cannot be read."""
     try:
         # Some editors begin a file with a byte order mark.
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
@@ -191,9 +196,10 @@ def _parse(path: Path) -> Document:
 
 
 def command_line(overrides: Sequence[str], removals: Sequence[str]) -> Layer:
-    """Make the layer of `--set` and `--unset`. A value is read as TOML, or else as a string without quotes.
+    """Make the layer of the options `--set` (`overrides`) and `--unset` (`removals`).
 
-    Raises SceneError for an override that is not "section.key=value".
+    A value is read as TOML; if it is not TOML, it is a string without quotes. Raises SceneError for an override that is
+    not "section.key=value".
     """
     values = {}
     for override in overrides:
@@ -223,7 +229,8 @@ def check_command_line(given: Layer, variants: Mapping[str, Layer], existing: It
     """Raise SceneError if the command line changes an unknown variant, a key that a variant changes itself, or a key
     that has no effect because all variants remove it.
 
-    The error names the option that changes the key in one variant alone.
+    `given` is the layer of the command line. `variants` holds the layers of the variants, and `existing` the names of
+    the variants in the file. The error names the option that changes the key in one variant alone.
     """
     for option, keys, end in (("--set", given.values, "=..."), ("--unset", given.unset, "")):
         for key in keys:

@@ -25,8 +25,8 @@ def built_in_weights() -> list[str]:
 class Model(Section):
     """The terms whose sum moves the particles, each with its settings; a preset is a named list of terms.
 
-    When the section is made, the preset gives `terms` and the absent keys of `settings`. Then `preset` becomes None. In
-    Python, the settings of each term are given as an object or as a dict.
+    `settings` maps the name of each term to its settings; in Python, these are given as an object or as a dict. When
+    the section is made, the preset gives `terms` and the absent keys of `settings`. Then `preset` becomes None.
     """
 
     preset: str | None = choice(f"name of a predefined list of terms; absent: {DEFAULT_PRESET}, unless terms is given",
@@ -76,12 +76,12 @@ class Model(Section):
 
     @property
     def reads(self) -> frozenset[str]:
-        """The inputs of all terms together."""
+        """The inputs of all terms together, such as "pairs"."""
         return frozenset(chain.from_iterable(settings.reads for settings in self.settings.values()))
 
     @property
     def gives(self) -> frozenset[str]:
-        """The outputs of all terms together."""
+        """The outputs of all terms together, such as "acceleration"."""
         return frozenset(chain.from_iterable(settings.gives for settings in self.settings.values()))
 
     @property
@@ -91,10 +91,10 @@ class Model(Section):
 
 
 def replace_terms(table: dict[str, Any], keys: set[str]) -> None:
-    """Remove `terms` from a [model] table if the last layer sets only `preset`, or `preset` if it sets only `terms`.
+    """Remove `terms` from the table of [model] if a layer sets only `preset`, or `preset` if it sets only `terms`.
 
-    Settings of terms that the remaining list does not name are removed too, unless the layer sets them. `keys` are the
-    keys "section.key" and the sections that the layer sets.
+    Settings of terms that are then not in the list of terms are removed too, unless the layer sets them. `table` is the
+    table after the layer has changed it. `keys` are the keys "section.key" and the sections that the layer sets.
     """
     if ("model.preset" in keys) == ("model.terms" in keys):
         return
@@ -128,7 +128,10 @@ def settings_class(term: str) -> type[TermSettings]:
 
 def _settings(term: str, name: str, preset: Mapping[str, Any],
               given: TermSettings | Mapping[str, Any]) -> TermSettings:
-    """Return the settings of a term: the given object, or one made from the preset and the given keys."""
+    """Return the settings of a term: the object `given`, or an object made from the preset and the keys in `given`.
+
+    `term` is the built-in name or the import path of the term, and `name` its name in the scene.
+    """
     try:
         kind = settings_class(term)
     except (ImportPathError, SceneError) as error:

@@ -20,7 +20,7 @@ SHOWN, MOST_BITS = 60, 10_000
 
 @dataclass(frozen=True)
 class Bounds:
-    """The interval of a number, open (`above`, `below`) or closed (`at_least`, `at_most`)."""
+    """The interval of allowed numbers. `above` and `below` exclude its ends, `at_least` and `at_most` include them."""
 
     above: float = -math.inf
     at_least: float = -math.inf
@@ -123,7 +123,10 @@ class Rule:
 
 
 def nearest(given: str, valid: Iterable[str], cutoff: float = 0.6) -> str:
-    """Return the hint "did you mean ...? " with the nearest valid spelling; empty if none is near."""
+    """Return the hint "did you mean ...? " with the nearest valid spelling; empty if none is near.
+
+    `cutoff` is the smallest similarity of a near spelling, from 0 to 1.
+    """
     near = difflib.get_close_matches(given, list(valid), n=1, cutoff=cutoff)
     return f"did you mean {near[0]}? " if near else ""
 

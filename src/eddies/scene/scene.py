@@ -33,7 +33,7 @@ SCENE_ONLY_KEYS = ("name", "base", "realisations", VARIANT)
 
 @dataclass(frozen=True, kw_only=True)
 class Scene(Section):
-    """A whole scene. The constructor checks its values and whether its sections fit together (SceneError).
+    """A whole scene. The constructor raises SceneError if a value is not allowed or sections do not fit together.
 
     When a scene with [tracks] is run, it gets the sections `flow` and `tracers` from the file with the tracks
     (`workflows.tracks.with_tracks`). Before that, these sections are None, and the cross-checks are left out.
@@ -83,7 +83,7 @@ class Scene(Section):
         return replace(self, variant={}, realisations=None) if self.variant or self.realisations else self
 
     def realisation(self, seed: int) -> "Scene":
-        """The scene with another seed.
+        """Return the scene with another seed.
 
         If an initial flow of kind file is read from FOLDER/NAME, the new scene reads FOLDER/realisation-SEED/NAME.
         """
@@ -95,7 +95,7 @@ class Scene(Section):
 
     @property
     def ground_truth_alone(self) -> "Scene":
-        """The scene without kernel, reconstruction, model and rollout."""
+        """The scene without variants, kernel, reconstruction, model and rollout."""
         return replace(self.without_variants, kernel=None, reconstruction=None, model=None, training=None,
                        simulation=None, eulerian=None)
 
@@ -138,7 +138,7 @@ class Scene(Section):
         return tuple(stage for stage in STAGES if stage in asked)
 
     def inputs(self, stage: str) -> tuple[Stage, ...]:
-        """The stages of the scene whose products the given stage reads."""
+        """Return the stages of the scene on whose products the given stage depends."""
         return tuple(STAGES[name] for name in STAGES[stage].depends_on if name in self.stages)
 
     @property
@@ -159,7 +159,8 @@ class Scene(Section):
 
     @property
     def duration(self) -> float | None:
-        """Length of the direct simulation after its spin-up: in turnovers with tracers, else in units of time."""
+        """Length of the direct simulation after its spin-up: with tracers in turnovers, without tracers in the unit of
+        time."""
         return self.tracers.turnovers if self.tracers is not None else self.time.duration
 
     @property
@@ -168,9 +169,9 @@ class Scene(Section):
         return self.training.window if self.training else DEFAULT_WINDOW
 
     def seen_in(self, directory: Path) -> float:
-        """Fraction of the ground truth in a run directory that training uses.
+        """Return the fraction that training uses of the ground truth in a run directory.
 
-        It is 0 without [training], and if [training] truths names only other ground truths.
+        It is 0 if the scene has no [training], or if [training] truths names only other ground truths.
         """
         if self.training is None:
             return 0.0
@@ -186,13 +187,17 @@ class Scene(Section):
 
     @property
     def needs_resolved_velocity(self) -> bool:
-        """Whether a grid resolves the velocity, because terms of the model read it or because particles are forced."""
+        """Whether the velocity must be resolved on a grid, because terms of the model read it or particles are forced.
+
+        The particles are tracers or those of the rollout.
+        """
         return bool(self.model and "resolved" in self.model.reads or self.tracers and self.tracers.forced
                     or self.rollout_is_forced)
 
     @property
     def tracers_resolving(self) -> Tracers | None:
-        """Tracers, so many that one frame of them would resolve the modes of [reconstruction]; None without it."""
+        """The section [tracers] with so many particles that one frame of them would resolve the modes of
+        [reconstruction]; None without [tracers] or [reconstruction]."""
         if self.reconstruction is None or self.tracers is None:
             return None
         return self.reconstruction.resolving(self.tracers, (self.tracks or self.tracers).filtered)
@@ -281,7 +286,8 @@ class Scene(Section):
             yield from ((f"{VARIANT}.{name}", problem) for problem in self._problems_of_variant(name))
 
     def _problems_of_variant(self, name: str) -> Iterator[str]:
-        """Yield the problems of a variant that cannot run beside the others, or whose rollouts cannot be compared."""
+        """Yield the reasons why a variant cannot run beside the other variants, or why its rollouts cannot be compared
+        with theirs."""
         variant = self.variant[name]
         if problem := checks.problem_of_name(name):
             yield problem
@@ -369,7 +375,8 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = (), removals
 
 
 def _tables_of_variants(document: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return a table of changed keys for each variant. Raises SceneError if [variant] is not a section of sections."""
+    """Return, by name of the variant, the table of the keys that it changes. Raises SceneError if [variant] holds
+    anything but sections."""
     tables = document.get(VARIANT, {})
     if not isinstance(tables, dict) or not all(isinstance(table, dict) for table in tables.values()):
         raise SceneError(f"{VARIANT}: must be sections; write [{VARIANT}.NAME] and the changed keys below", VARIANT)
@@ -377,7 +384,7 @@ def _tables_of_variants(document: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def _variant(document: dict[str, Any], name: str, layer: Layer) -> Scene:
-    """The scene of a variant: the document with the variant's changes."""
+    """Make the scene of the variant `name` from the document of the whole scene and the changes in `layer`."""
     try:
         for key in layer.values:
             if key.partition(".")[0] in SCENE_ONLY_KEYS:
@@ -390,5 +397,5 @@ def _variant(document: dict[str, Any], name: str, layer: Layer) -> Scene:
 
 
 def builtin_scenes() -> list[tuple[str, str]]:
-    """Return name and title of every scene that comes with the package, in order of name."""
+    """Return (name, title) for each scene that comes with the package, in order of name."""
     return [(path.stem, read_document(path.stem)[1]["title"]) for path in sorted(BUILT_IN.glob("*.toml"))]

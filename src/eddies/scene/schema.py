@@ -1,4 +1,5 @@
-"""The JSON schema of scenes, from the declarations of their keys: editors complete and check scene files with it."""
+"""The JSON schema of scenes, made from the declarations of their keys. Editors use it to complete and check the files
+of scenes."""
 
 import dataclasses
 from typing import Any
@@ -17,7 +18,8 @@ LIMITS = {"above": "exclusiveMinimum", "at_least": "minimum", "below": "exclusiv
 def json_schema() -> dict[str, Any]:
     """Return the JSON schema (draft 2020-12) of a scene file.
 
-    The schema requires no key, because a base may give any of them. It accepts any key in sections of users' own terms.
+    The schema requires no key, because the base of a scene may give any key. In a section [model.NAME] of a user's own
+    term it accepts all keys.
     """
     schema = _object(Scene)
     schema["properties"] |= {
@@ -28,7 +30,7 @@ def json_schema() -> dict[str, Any]:
 
 
 def _object(kind: type[Section]) -> dict[str, Any]:
-    """The schema of a section."""
+    """Return the schema of a section."""
     properties = {}
     for field in dataclasses.fields(kind):
         rule, inner = rule_of(kind, field), field.metadata.get("section")
@@ -43,7 +45,7 @@ def _object(kind: type[Section]) -> dict[str, Any]:
 
 
 def _value(rule: Rule, default: Any) -> dict[str, Any]:
-    """The schema of one key."""
+    """Return the schema of one key."""
     choices: list[dict[str, Any]] = [{"enum": [*rule.words]}] if rule.words else []
     if rule.paths:
         choices.append({"type": "string", "pattern": ":"})

@@ -1,4 +1,4 @@
-"""The sections of a scene, each a frozen dataclass whose fields declare their keys.
+"""The sections of a scene. Each section is a frozen dataclass, and each of its fields declares one key.
 
 Lengths are in units of the cube [0, 2 pi)^3, the mean density is 1, and the unit of time follows from lengths and
 velocities.
@@ -30,7 +30,7 @@ NEIGHBORS = 60.0
 
 @dataclass(frozen=True, kw_only=True)
 class Flow(Section):
-    """The fluid and the grid on which the direct simulation resolves it; every scene without [tracks] needs it."""
+    """The fluid, and the grid of the direct simulation. Every scene without [tracks] needs this section."""
 
     fluid: str = named("equations of motion", "incompressible", "compressible")
     cells: int = integer("grid cells along each side of the cube", at_least=8, at_most=MOST_CELLS)
@@ -50,7 +50,7 @@ class Flow(Section):
 
     @property
     def real_bytes(self) -> int:
-        """Bytes of a real number on the grid."""
+        """Number of bytes of a real number on the grid."""
         return 4 if self.precision == "float32" else 8
 
     @property
@@ -64,15 +64,17 @@ class InitialFlow:
     """Properties of an initial flow that are known before it is made."""
 
     keys: tuple[str, ...] = ("amplitude", "peak_wavenumber", "wavenumber", "path", "state")  # its keys in [initial]
-    rms: float | None = None  # root mean square of |u|, divided by the amplitude; None: unknown, or at rest
-    peak: float | None = None  # largest |u| + |v| + |w|, divided by the amplitude; None: unknown, or at rest
-    turbulent: bool = False  # it has many scales, with the spectrum's peak at `peak_wavenumber`
-    sound: bool = False  # at rest except for sound waves
-    steady: bool = False  # without viscosity it has no acceleration
+    # The root mean square of the speed, and the largest sum of the magnitudes of the three velocity components, both
+    # divided by the amplitude; None: unknown, or the flow is at rest.
+    rms: float | None = None
+    peak: float | None = None
+    turbulent: bool = False  # whether it has many scales; its spectrum then has its peak at `peak_wavenumber`
+    sound: bool = False  # whether it is at rest except for sound waves
+    steady: bool = False  # whether it has no acceleration without viscosity
 
     @property
     def from_file(self) -> bool:
-        """Whether it is a stored state, read from a file."""
+        """Whether the flow is a stored state, which is read from a file."""
         return self.keys == ("path", "state")
 
 
@@ -256,7 +258,8 @@ class Tracers(Section):
                 object.__setattr__(self, field.name, getattr(chosen, field.name))
 
     def _set_of(self, name: str, own: Any) -> Tracers:
-        """Make a set from its table or object; its keys outside SET_KEYS get the values of this section."""
+        """Make the set `name` from `own`, its table or object. Keys that the table lacks, and all keys outside
+        SET_KEYS, get the values of this section."""
         if isinstance(own, Tracers):
             return dataclasses.replace(self, sets={}, set=None, **{key: getattr(own, key) for key in SET_KEYS})
         if not isinstance(own, dict):
@@ -272,7 +275,7 @@ class Tracers(Section):
             raise problem.within(f"tracers.{name}") from None
 
     def with_count(self, count: int) -> Tracers:
-        """The same section with another number of particles, at random places."""
+        """Return the same section with `count` particles, at random places."""
         return dataclasses.replace(self, particles_per_side=None, count=count, placement="random")
 
     @property
@@ -287,7 +290,7 @@ class Tracers(Section):
 
     @property
     def spacing(self) -> float:
-        """Mean spacing L / N^(1/3) of the particles."""
+        """Mean spacing L / N^(1/3) of the particles; L is the edge of the cube."""
         return BOX_LENGTH / self._per_side
 
     @property
@@ -296,7 +299,10 @@ class Tracers(Section):
         return self.particles_per_side or round(math.cbrt(self.particles), 9)
 
     def radius_of(self, neighbors: float) -> float:
-        """Radius h of the ball that holds n = `neighbors` of the N particles on average: n = N (4/3) pi h^3 / L^3."""
+        """Return the radius h of a ball that holds n = `neighbors` of the N particles on average.
+
+        It satisfies n = N (4/3) pi h^3 / L^3, where L is the edge of the cube.
+        """
         return BOX_LENGTH * (neighbors / self.particles / (4 / 3 * math.pi)) ** (1 / 3)
 
     @property
@@ -306,24 +312,26 @@ class Tracers(Section):
 
     @property
     def planes(self) -> int:
-        """Cells along each side of the grid of the resolved velocity. The slabs of particles consist of whole planes of
-        this grid."""
+        """Number of cells along each side of the grid of the resolved velocity. Each rank holds the particles of a slab
+        of the cube, and a slab consists of whole planes of this grid."""
         return planes_for(self.particles)
 
 
-#: Cells of the grid of the resolved velocity per shortest resolved wavelength; cubic splines can represent this wave.
+#: Number of cells in the shortest wavelength that the grid of the resolved velocity resolves. Cubic splines can
+#: represent a wave of this length.
 CELLS_PER_WAVENUMBER = 7 / 3
 
 
 def planes_for(particles: int) -> int:
-    """`Tracers.planes` for a number of particles N: 1.75 N^(1/3), rounded to even.
+    """Return `Tracers.planes` for a number of particles N: 1.75 N^(1/3), rounded to even.
 
-    The highest resolved wavenumber is 1.5 times the Nyquist wavenumber of the particles, 0.75 N^(1/3).
+    The highest resolved wavenumber is 0.75 N^(1/3). This is 1.5 times the Nyquist wavenumber N^(1/3) / 2 of the
+    particles.
     """
     return 2 * round(0.75 / 2 * CELLS_PER_WAVENUMBER * round(math.cbrt(particles), 9))
 
 
-#: Defaults of keys of [kernel], and the values that replace them in each preset.
+#: The defaults of keys of [kernel], and for each preset the values that replace defaults.
 KERNEL_DEFAULTS = {"form": "kriging", "positive": True, "cutoff": "smooth", "normalization_weight": 0.0,
                    "learning_rate": 2e-3}
 KERNEL_PRESETS = {"paper": {"form": "average", "positive": False, "cutoff": "sigmoid", "normalization_weight": 1.0,
@@ -334,7 +342,7 @@ FINAL_RATE = 0.05
 
 @dataclass(frozen=True, kw_only=True)
 class Kernel(Section):
-    """The smoothing kernel W, learned by reconstructing the filtered field, and the reconstruction of fields.
+    """The smoothing kernel W, trained to reconstruct the filtered field, and the method that reconstructs fields.
 
     When the section is made, the preset fills the absent keys, and `preset` becomes None.
     """
@@ -400,11 +408,12 @@ class Reconstruction(Section):
         return self.method not in ("least-squares", "memory")
 
     def resolving(self, tracers: Tracers, filtered: bool) -> Tracers:
-        """Tracers, so many that one frame of them would resolve the modes of the reconstruction.
+        """Return `tracers` with so many particles that one frame of them would resolve the modes of the reconstruction.
 
-        These are eight times as many as `tracers` if the method is "memory" and the flow is unfiltered. The memory then
-        keeps modes that `tracers` determine only over several frames (docs/tracks.md). If the tracks are `filtered`,
-        further modes gain little, because the removal of the filter amplifies their errors.
+        The number of particles changes only if the method is "memory" and the flow is unfiltered: it is then eight
+        times that of `tracers`, because the memory keeps modes that `tracers` determine only over several frames
+        (docs/tracks.md). If the tracks are `filtered`, further modes gain little, because the removal of the filter
+        amplifies their errors.
         """
         return tracers.with_count(8 * tracers.particles) if self.method == "memory" and not filtered else tracers
 
@@ -430,7 +439,7 @@ class Horizons(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class Training(Section):
-    """The fit of the force to trajectories, then to all losses together, then through the simulation."""
+    """The training of the model: on trajectories, then with all losses, then through steps of the simulation."""
 
     truths: tuple[str, ...] | None = texts("run directories or files of the ground truths to train on, each with its "
                                            "own scales; absent: the run's own", default=None)
@@ -475,9 +484,9 @@ class Training(Section):
 class Method:
     """Properties of a method that moves the particles of a rollout."""
 
-    needs: tuple[str, ...] = ()  # some of NEEDS
+    needs: tuple[str, ...] = ()  # what it needs, any of NEEDS
     title: str = "own method"  # name in tables and figures
-    on_grid: bool = False  # a flow on a coarse grid moves the particles, as given in [eulerian]
+    on_grid: bool = False  # whether a flow on a coarse grid, with the settings in [eulerian], moves the particles
 
 
 METHODS = {
@@ -485,7 +494,7 @@ METHODS = {
     "none": Method(title="no force"),
     "eulerian": Method(title="coarse grid", on_grid=True),
 }
-# Needs of a method: a trained model, the density of the ground truth, neighbours within the radius of interaction.
+# What a method may need: a trained model, the density of the ground truth, neighbours within the radius of interaction.
 NEEDS = ("model", "density", "pairs")
 #: If [simulation] step has this value, short rollouts find the step.
 CONVERGED = "converged"
@@ -548,7 +557,7 @@ class Simulation(Section):
 
     @property
     def step_file(self) -> Path | None:
-        """The file of the step that `step_from` names; None without the key."""
+        """The file with the converged step of the run that `step_from` names; None without the key."""
         return None if self.step_from is None else product_file(self.step_from, "find-step")
 
     @property
@@ -585,11 +594,11 @@ class Simulation(Section):
 
 @dataclass(frozen=True)
 class Closure:
-    """Properties of a closure of the coarse grid."""
+    """Properties of a closure, the model of the scales that the coarse grid or the filter leaves out."""
 
-    equations: tuple[str, ...]  # equations that it closes
+    equations: tuple[str, ...]  # those of EQUATIONS that it can close
     constant: str | None = None  # key of [eulerian] with its constant
-    learned: bool = False  # it uses the damping rates that a model has learned
+    learned: bool = False  # whether it uses the damping rates that a model has learned
 
 
 EQUATIONS = ("unfiltered", "filtered")
@@ -606,7 +615,7 @@ CLOSURES = {
 
 @dataclass(frozen=True, kw_only=True)
 class Eulerian(Section):
-    """Large-eddy simulation on a coarse grid, with method = "eulerian"; absent: the defaults."""
+    """Large-eddy simulation on a coarse grid, for method = "eulerian"; without this section, the defaults hold."""
 
     cells: int | None = integer("cells along each side of the coarse grid; absent: the fewest whose Nyquist wavenumber "
                                 "reaches pi / filter width, at least 8", default=None, at_least=8)
@@ -639,7 +648,8 @@ class Eulerian(Section):
         return self.fluid == "compressible"
 
     def cells_for(self, filter_width: float) -> int:
-        """Cells along each side: as given, or the fewest whose Nyquist wavenumber reaches pi / filter width."""
+        """Return the number of cells along each side: `cells`, or without this key the smallest number, at least 8,
+        whose Nyquist wavenumber reaches pi / filter width."""
         if self.cells is not None:
             return self.cells
         return max(math.ceil(BOX_LENGTH / filter_width - 1e-9), 8)

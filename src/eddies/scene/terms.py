@@ -1,6 +1,7 @@
-"""The settings and properties of each term, and the presets, which are named lists of terms. Does not need torch.
+"""The settings and properties of each term, and the presets, which are named lists of terms.
 
-A class of settings is a section of a scene: a frozen dataclass whose fields declare the keys of [model.NAME].
+A class of settings is a section of a scene: a frozen dataclass whose fields declare the keys of [model.NAME]. This
+module does not need torch.
 """
 
 from __future__ import annotations
@@ -17,21 +18,30 @@ from eddies.scene.values import Section, boolean, choice, integer, integers, nam
 
 READS = ("pairs", "resolved", "density")
 GIVES = ("acceleration", "density", "density_rate", "shift_velocity")
-#: The inputs of a pair network, in units of the flow: the densities of both particles, and |x|, |v| and x.v of their
-#: separation x and their relative velocity v.
+#: The inputs of a network that gets pairs of particles, in units of the flow: the densities of both particles, and |x|,
+#: |v| and x.v of their separation x and their relative velocity v.
 INPUTS = ("density", "distance", "speed", "approach")
 BASES = ("corrected", "paper", "unit")
-# The ratio of the largest rate of relaxation to the nominal rate. The estimate from neighbours repeats the noise of a
-# particle with the opposite sign. The ratio is therefore 3.6 to 4.0, both among random particles and in turbulence. Two
-# fifths of 4.0 are added, because other effects let noise grow too: with a ratio of 4.2 a flow at M_t = 0.16 diverged
-# after a turnover, and with 5.5 a flow on 256^3 cells diverged after a few steps.
+# The ratio of the largest rate at which the noise of a particle relaxes to the rate that the key `relaxation` gives. A
+# velocity relaxes to the estimate from its neighbours, and this estimate repeats the noise of the particle with the
+# opposite sign. The ratio is therefore 3.6 to 4.0, both among random particles and in turbulence. Two fifths of 4.0 are
+# added, because other effects let noise grow too: with a ratio of 4.2 a flow at M_t = 0.16 diverged after a turnover,
+# and with 5.5 a flow on 256^3 cells diverged after a few steps.
 NOISE_AMONG_NEIGHBORS = 5.6
 
 
 @dataclass(frozen=True, kw_only=True)
 class StepUnits:
-    """The numbers that limit the step of a rollout: the radius of interaction, the filter width, the sound speed (None:
-    the flow has no sound), the rms of a component of the velocity (None: unknown), and the time stepping scheme."""
+    """The quantities that limit the time step of a rollout.
+
+    Parameters
+    ----------
+    radius : radius of interaction.
+    filter_width : width of the Gaussian filter.
+    sound_speed : speed of sound; None if the flow has no sound.
+    velocity : rms of a component of the velocity; None if it is unknown.
+    scheme : time stepping scheme.
+    """
 
     radius: float
     filter_width: float
@@ -57,8 +67,9 @@ class TermSettings(Section):
     Attributes
     ----------
     word : name of the term in scenes; empty for a user's class.
-    reads : its inputs, any of "pairs" (neighbours within the interaction radius, also for kriging), "resolved" (the
-        velocity on a grid) and "density" (computed, stored, and needed in the ground truth). It gets no others.
+    reads : its inputs, any of "pairs" (neighbours within the radius of interaction, also for kriging), "resolved" (the
+        velocity on a grid) and "density" (computed and stored by the rollout, needed in the ground truth). The term
+        gets no other inputs.
     gives : its outputs, any of "acceleration", "density" (a contribution to it), "density_rate" and "shift_velocity".
     learns_through_horizons : whether only training through several steps of the simulation fits its parameters.
     viscous : whether it needs the viscosity of the fluid.
@@ -77,18 +88,19 @@ class TermSettings(Section):
     too_long: ClassVar[str] = ""
 
     def longest_step(self, units: StepUnits) -> float:
-        """The longest step of a rollout that the term allows; infinite if there is no limit, or if it is unknown."""
+        """Return the longest step of a rollout that the term allows; infinite if there is no limit, or if the limit is
+        unknown."""
         return math.inf
 
     @classmethod
     def section_name(cls) -> str:
-        """The name of the class, because only the scene knows the name of the section."""
+        """Return the name of the class, because only the scene knows the name of the section."""
         return cls.__qualname__
 
 
 @dataclass(frozen=True, kw_only=True)
 class PairSum(TermSettings):
-    """A sum over pairs, with the weight of each pair and the scaling of the sum."""
+    """Settings of a term that is a sum over pairs: the weight of each pair, and the scaling of the sum."""
 
     window: str = choice("factor of a pair at the distance q, in radii of interaction; smooth: (1 - q^2)^2; none: 1, "
                          "so that rates jump when a neighbour enters or leaves", "smooth", "none",
@@ -99,7 +111,7 @@ class PairSum(TermSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class ForceSum(PairSum):
-    """A sum of forces between pairs along two directions."""
+    """Settings of a term that is a sum of pair forces. The force of a pair has components along two directions."""
 
     basis: str = choice("directions of a pair's forces; paper: x and v of Eq. 4; unit: x/|x| and v/|v|; corrected: x "
                         "and v, with the inverse moment matrix as the scaling of the sum", *BASES,
@@ -115,7 +127,7 @@ class ForceSum(PairSum):
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkSettings(PairSum):
-    """A network of the invariants of a pair."""
+    """Settings of a term with a network, whose inputs are quantities of a pair that no rotation changes."""
 
     hidden: tuple[int, ...] = integers("widths of the network's layers", default=(16, 16), at_least=1)
     inputs: tuple[str, ...] = texts("inputs of the network", *INPUTS, default=INPUTS)
@@ -123,13 +135,13 @@ class NetworkSettings(PairSum):
 
     @property
     def reads(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Pairs, and the density if it is an input."""
+        """Pairs, and the density if it is an input of the network."""
         return ("pairs", "density") if "density" in self.inputs else ("pairs",)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PairNetwork(ForceSum, NetworkSettings):
-    """The learned pair force, Eqs. 3 and 4."""
+    """The learned force between pairs, Eqs. 3 and 4 of the paper."""
 
     word = "pairs"
 
@@ -145,7 +157,7 @@ class PairNetwork(ForceSum, NetworkSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class EddyViscosity(ForceSum):
-    """Explicit eddy viscosity between pairs, the term Pi of Eq. 3."""
+    """Explicit eddy viscosity between pairs: the term Pi in Eq. 3 of the paper."""
 
     word = "eddy-viscosity"
 
@@ -156,7 +168,7 @@ class EddyViscosity(ForceSum):
 
 @dataclass(frozen=True, kw_only=True)
 class DensityFlux(NetworkSettings):
-    """The network of the density in Eq. 3."""
+    """The network that gives the rate of the density in Eq. 3 of the paper."""
 
     word = "density-flux"
 
@@ -269,7 +281,8 @@ class WCSPH(TermSettings):
                 'sound speed; lower step, and use integrator = "verlet"')
 
     def longest_step(self, units: StepUnits) -> float:
-        """0.4 h / (c (1 + 0.6 alpha)) (Monaghan 1992); h: half the kernel's support, c: sound speed of the pressure."""
+        """Return 0.4 h / (c (1 + 0.6 alpha)) (Monaghan 1992), where h is half the radius of interaction and c the sound
+        speed of the pressure; infinite if the flow has no sound."""
         if units.sound_speed is None:
             return math.inf
         return 0.4 * units.radius / 2 / (self.speed * units.sound_speed * (1 + 0.6 * self.alpha))
@@ -307,7 +320,8 @@ class FilteredEquations(TermSettings):
                 'the term "{name}" damps, grows instead; lower step to {longest}')
 
     def longest_step(self, units: StepUnits) -> float:
-        """The longest step with which the scheme stably relaxes the noise of single particles."""
+        """Return the longest step with which the scheme relaxes the noise of single particles without instability;
+        infinite without relaxation, or if the rms of the velocity is unknown."""
         if not units.velocity or not self.relaxation:
             return math.inf
         rate = NOISE_AMONG_NEIGHBORS * self.relaxation * 2 * units.velocity / units.filter_width
@@ -318,17 +332,19 @@ class FilteredEquations(TermSettings):
 TERMS: dict[str, type[TermSettings]] = {kind.word: kind for kind in list(globals().values())
                                         if isinstance(kind, type) and issubclass(kind, TermSettings) and kind.word}
 
-# Values near those that training finds. With the usual values the friction is tens of times as large as the
-# accelerations of turbulence.
+# Coefficients of the artificial viscosity of "wcsph", near those that training finds. With the usual values, the
+# friction is tens of times as large as the accelerations of turbulence.
 LITTLE_FRICTION = {"alpha": 0.05, "beta": 1.5}
 
 RESOLVED = ("pressure", "stress", "viscosity", "damping", "relaxation")
 
 
 def _published(basis: str, hidden: tuple[int, ...]) -> dict[str, Mapping[str, Any]]:
-    """Return the terms of Eq. 3 with their settings: networks of force and density, and Pi in both equations.
+    """Return the terms of Eq. 3 of the paper with their settings: the networks of force and density, and the term Pi in
+    the equations of both.
 
-    Settings that the paper does not state are those of its public code.
+    `hidden` holds the widths of the networks' layers. Settings that the paper does not state are those of its public
+    code.
     """
     plain, network = {"window": "none", "scaling": "root"}, {"hidden": hidden}
     return {"pairs": {"basis": basis, **plain, **network},

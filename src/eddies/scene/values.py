@@ -1,8 +1,9 @@
-"""Sections of a scene: frozen dataclasses whose fields declare their keys.
+"""The base class of the sections of a scene, and functions to declare, read and write sections.
 
-A field declares its key by a function (`number`, `numbers`, `integer`, `integers`, `boolean`, `choice`, `named`, `text`
-or `texts`), which takes the meaning, the allowed values and the default. Errors, written scenes, the reference page and
-the JSON schema use this one declaration. It applies to objects made in a program and to those read from a TOML file.
+A section is a frozen dataclass. Each field declares a key by a function (`number`, `numbers`, `integer`, `integers`,
+`boolean`, `choice`, `named`, `text` or `texts`). Its arguments are the meaning of the key (`about`), the allowed values
+and the default. Errors, written scenes, the reference page and the JSON schema use this one declaration. It applies to
+objects made in a program and to those read from a TOML file.
 """
 
 import dataclasses
@@ -25,7 +26,7 @@ ABSENT = "none"
 class SceneError(UserError, ValueError):
     """A scene cannot be used; the text gives the value, the allowed values, and a remedy.
 
-    `key` is the "section.key" at fault; empty if no single key is.
+    `key` is the "section.key" at fault; empty if no single key is at fault.
     """
 
     def __init__(self, message: str, key: str = ""):
@@ -46,7 +47,7 @@ class KeyProblem(SceneError):
 
 
 class Section:
-    """Base of the dataclasses of a scene. The constructor checks every value and stores what `Rule.accept` returns.
+    """Base class of the sections of a scene. The constructor checks every value and stores what `Rule.accept` returns.
 
     Raises KeyProblem for a value that its declaration does not allow.
 
@@ -64,7 +65,7 @@ class Section:
 
     @classmethod
     def section_name(cls) -> str:
-        """The name of the section in errors: the name of the class, written as in scenes."""
+        """Return the name of the section in errors: the name of the class, written as in scenes."""
         return re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
 
     def problem(self, key: str, problem: str) -> KeyProblem:
@@ -88,22 +89,22 @@ class Section:
 
 
 def number(about: str, default: Any = MISSING, words: tuple[str, ...] = (), **bounds: float) -> Any:
-    """Declare a dataclass field that holds a real number, or one of `words`."""
+    """Declare a dataclass field that holds a real number within `bounds` (see `Bounds`), or one of `words`."""
     return _declare(Rule(float, about, Bounds(**bounds), words), default)
 
 
 def integer(about: str, default: Any = MISSING, **bounds: float) -> Any:
-    """Declare a dataclass field that holds a whole number."""
+    """Declare a dataclass field that holds a whole number within `bounds` (see `Bounds`)."""
     return _declare(Rule(int, about, Bounds(**bounds)), default)
 
 
 def integers(about: str, default: Any = MISSING, **bounds: float) -> Any:
-    """Declare a dataclass field that holds a tuple of whole numbers."""
+    """Declare a dataclass field that holds a tuple of whole numbers, each within `bounds` (see `Bounds`)."""
     return _declare(Rule(int, about, Bounds(**bounds), many=True), default)
 
 
 def numbers(about: str, default: Any = MISSING, **bounds: float) -> Any:
-    """Declare a dataclass field that holds a tuple of real numbers."""
+    """Declare a dataclass field that holds a tuple of real numbers, each within `bounds` (see `Bounds`)."""
     return _declare(Rule(float, about, Bounds(**bounds), many=True), default)
 
 
@@ -128,9 +129,9 @@ def text(about: str, default: Any = MISSING) -> Any:
 
 
 def texts(about: str, *words: str, default: Any = MISSING, paths: bool = False) -> Any:
-    """Declare a dataclass field that holds a tuple of strings. If `words` are given, no other strings are allowed.
+    """Declare a dataclass field that holds a tuple of strings.
 
-    If `paths` is true, import paths are allowed, too.
+    If `words` are given, each string must be one of them or, if `paths` is true, the import path of a user's own class.
     """
     return _declare(Rule(str, about, words=words, paths=paths, many=True), default)
 
@@ -226,7 +227,7 @@ def write_section(section: Section, name: str = "", all_keys: bool = False) -> l
             for key, part in value.items():
                 written = [line for line in write_section(part, all_keys=all_keys) if line not in lines]
                 same = isinstance(part, type(section))
-                if same:  # write absent keys, or the outer section would give them
+                if same:  # write keys that are absent here, or the outer section would give their values
                     written += [f'{each.name} = "{ABSENT}"' for each in dataclasses.fields(part)
                                 if getattr(part, each.name) is None and getattr(section, each.name) is not None]
                 if written or same:
@@ -235,7 +236,7 @@ def write_section(section: Section, name: str = "", all_keys: bool = False) -> l
 
 
 def _declared_lines(kind: type[Section]) -> list[str]:
-    """The lines of the keys of an absent section, with their defaults."""
+    """Return the lines of the keys of an absent section, with their defaults."""
     rules = [(field, rule_of(kind, field)) for field in dataclasses.fields(kind)]
     return [_line(field.name, rule, None if field.default is MISSING else field.default) for field, rule in rules
             if rule is not None]
@@ -247,7 +248,8 @@ def _line(key: str, rule: Rule, value: Any) -> str:
 
 
 def import_paths(part: Section) -> Iterator[tuple[str, str]]:
-    """Yield (key, import path) for each import path in a section and in its inner sections."""
+    """Yield (key, import path) for each import path in a section and in its inner sections; a key has the form "key" or
+    "section.key"."""
     for field in dataclasses.fields(part):
         rule, value = rule_of(type(part), field), getattr(part, field.name)
         if rule is not None and rule.paths:
