@@ -128,7 +128,7 @@ class CheckpointDirectory:
 
     def newest(self) -> Checkpoint | None:
         """Return the newest undamaged checkpoint with this fingerprint, or None. This checkpoint, its files and older
-        checkpoints are kept; everything else in the directory is removed. A warning says why a newer one is not used.
+        checkpoints are kept; everything else in the directory is removed. A warning says why newer ones are not used.
 
         Raises ProductError, and removes nothing, if the system refuses to read a file: the file may be undamaged.
         """
@@ -194,7 +194,7 @@ class Guard:
             raise Stopped(self.stop.reason, f"continues from step {run.steps}{self.of}")
 
     def save(self, run: Any, segments: FrameSegments | None = None) -> None:
-        """Write a checkpoint of the present state."""
+        """Close the open segment, if any, and write a checkpoint of the present state."""
         began = time.perf_counter()
         if segments is not None:
             segments.close()
@@ -212,7 +212,7 @@ def checkpoints_in(path: Path) -> list[tuple[int, str]]:
 
 
 def _newest_first(directory: Path) -> list[Path]:
-    """Return the checkpoints in a directory, the newest first. In eddies 1.0 a checkpoint was a directory."""
+    """Return the checkpoints in a directory, the newest first. A checkpoint of eddies 1.0 is a directory itself."""
     paths = directory.iterdir() if directory.is_dir() else ()
     return sorted((path for path in paths if (name := NAME.fullmatch(path.name)) and path.is_dir() == (not name[2])),
                   key=_step_of, reverse=True)
@@ -223,8 +223,7 @@ def _step_of(path: Path) -> int:
 
 
 def _content(path: Path) -> dict[str, Any] | None:
-    """Return the content of a checkpoint; None if it is damaged. Raises ProductError if the system refuses to read
-    it."""
+    """Return the content of a checkpoint; None if it is damaged. ProductError if the system refuses to read it."""
     try:
         with read_errors(path):
             return {"step": _step_of(path), "format": 0} if path.is_dir() else Checkpoint(path).content

@@ -2,7 +2,7 @@
 
 The checksums cover all bytes, also those of HDF5's own structure. `open_to_read` opens a file so that each block of
 4096 bytes is compared with its checksum before HDF5 reads it. So a rank that reads a few frames checks only the blocks
-of these frames. `add_checksums` and `find_damage` process a whole file; the ranks share the blocks. Only these two
+of these frames. `add_checksums` and `find_damage` process a whole file, each rank a part of the blocks. Only these two
 functions import MPI.
 """
 
@@ -61,7 +61,8 @@ def open_to_read(path: str | Path) -> h5py.File:
 
 
 class CheckedFile(io.FileIO):
-    """A file object for h5py.File that checks each read. With `naming`, errors name the damaged dataset and frame."""
+    """A file object for h5py.File that checks each read. If `naming` is true, errors name the damaged dataset
+    and frame."""
 
     def __init__(self, path: str | Path, naming: bool = True) -> None:
         super().__init__(path)

@@ -56,6 +56,6 @@ class FieldSeries:
         return times
 
     def read(self, index: int, variable: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Return planes start, ..., stop - 1 of a variable, (components, stop - start, y, x). Errors are as in
-        `read_frame`."""
+        """Return planes start, ..., stop - 1 of a variable, (components, stop - start, y, x). Raises ProductError
+        as `read_frame` does."""
         return read_frame(self._group[variable], index, (slice(None), slice(start, stop)))

@@ -82,13 +82,13 @@ class VelocityCubes:
         return len(self._states)
 
     def read(self, index: int, variable: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Return planes start, ..., stop - 1 of the velocity, (3, stop - start, y, x). ProductError if one is
-        damaged."""
+        """Return planes start, ..., stop - 1 of the velocity, (3, stop - start, y, x). ProductError if one of
+        them is damaged."""
         return np.concatenate([_read_planes(dataset, start, stop) for dataset in self._states[index]])
 
     def check(self, comm: MPI.Comm, index: int, velocity: np.ndarray) -> None:
-        """Raise ProductError if the velocity of a state is uniform, too large or incomplete; collective. `velocity`
-        holds this rank's planes of the state."""
+        """Raise ProductError if the velocity of state `index` is uniform, too large or incomplete; collective.
+        `velocity` holds this rank's planes of this state."""
         dataset = self._states[index][0]
         own = [np.ravel(dataset.attrs[name]) for name in FILL_ATTRIBUTES if name in dataset.attrs]
         fills = dict.fromkeys([*NOT_DELIVERED, *(float(value[0]) for value in own

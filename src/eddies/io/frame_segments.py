@@ -1,5 +1,4 @@
-"""Segments, which are files with frames. They are closed at each checkpoint, so that a later failure cannot damage
-them."""
+"""Segments are files with frames. A segment is closed at each checkpoint, so that a later failure cannot damage it."""
 
 from __future__ import annotations
 
@@ -47,8 +46,8 @@ class FrameLayout:
                 ) -> tuple[dict[str, TrajectoryWriter], dict[str, FieldWriter]]:
         """Return the writers of trajectories and those of fields, as two dicts by name of the series; collective.
 
-        `names` maps the series that are written to their names in the file. If it is None, all series are written under
-        their own names. `images` adds the column `image` to trajectories with positions.
+        The keys of `names` are the series to be written, and its values are their names in the file. If it is None, all
+        series are written under their own names. `images` adds the column `image` to trajectories with positions.
         """
         if names is None:
             names = {name: name for name in (*self.trajectories, *self.fields)}

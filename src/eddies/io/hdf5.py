@@ -44,8 +44,8 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
                    provenance: Mapping[str, Any]) -> Iterator[h5py.File]:
     """Write a product, all ranks together. It appears under `path` after the block has ended without an exception.
 
-    `provenance` holds the scene's text, its fingerprint and more, and must be possible to write as JSON. It is stored
-    with the versions of all libraries, the number of ranks, the date and a new id. If it holds `made_from`, a list of
+    `provenance` holds the scene's text, its fingerprint and more values that JSON can store. It is stored with the
+    versions of all libraries, the number of ranks, the date and a new id. If it holds `made_from`, a list of
     kinds of products, the ids of these products in the same directory are stored instead of the list. If it holds `id`,
     the product gets this id, not a new one. A file that replaces a product can thus keep the id of that product, which
     other products may name as their origin.
@@ -68,8 +68,7 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
 
 @contextmanager
 def open_product(comm: MPI.Comm, path: str | Path, kind: str | None) -> Iterator[h5py.File]:
-    """Open a complete product to read it. `kind` None allows any kind. If one rank cannot open it, all ranks raise an
-    error.
+    """Open a complete product to read it. `kind` None allows any kind. An error of one rank is raised by all ranks.
 
     Raises:
         ProductError: the file is missing, truncated, not an HDF5 file, unfinished, or of another kind or format.
@@ -113,7 +112,7 @@ def find_group(file: h5py.Group, name: str) -> h5py.Group:
 
 
 def stored_numbers(file: h5py.File) -> Iterator[tuple[str, int | None, np.ndarray]]:
-    """Yield the floating-point numbers of an open product, as the name of their place, the frame and the values.
+    """Yield all floating-point numbers of an open product: for each dataset and attribute its name, a frame and values.
 
     Of a series, only the last frame is yielded. For all other numbers, attributes included, the frame is None.
     """
@@ -157,7 +156,7 @@ def append_frame(dataset: h5py.Dataset, block: np.ndarray, offset: tuple[int, ..
 
 
 def write_block(dataset: h5py.Dataset, block: np.ndarray, offset: tuple[int, ...]) -> None:
-    """Write a block, which may be empty, at an offset of a dataset; collective, within `writing`."""
+    """Write a block, which may be empty, at an offset of a dataset; collective, inside a `writing` block."""
     in_file, in_memory = dataset.id.get_space(), h5py.h5s.create_simple(block.shape)
     if block.size:
         in_file.select_hyperslab(offset, block.shape)

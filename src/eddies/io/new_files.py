@@ -7,7 +7,7 @@ leaves the former file as it was. There are two ways to write:
 - `new_file`: an HDF5 file, by all ranks together; `create_export` uses it for files that other programs read.
 
 HDF5 does not survive a write that fails: it crashes when it closes the file, or ranks wait for each other for ever.
-Measures 1 and 2 prevent this. Measure 3 is for an h5py that was built without MPI, such as the one of its wheels:
+Measures 1 and 2 prevent this. Measure 3 is for an h5py that was built without MPI, as the wheels of h5py are:
 
 1. Each write is announced by `writing`, which reserves the space on the disk first. If there is too little, all ranks
    raise WriteError before HDF5 writes; the file can then be closed and removed. A margin stays reserved for what HDF5
@@ -129,7 +129,7 @@ def create_export(path: Path, layout: Layout, provenance: Mapping[str, Any], ove
 
 @contextmanager
 def writing(group: h5py.Group | h5py.Dataset, size: int) -> Iterator[None]:
-    """Reserve `size` bytes of a new file, which the caller may write inside the block. `size` is equal on all ranks.
+    """Reserve `size` bytes of a new file, equal on all ranks. The caller may write them inside the block.
 
     Raises:
         WriteError: on all ranks; the disk is full.

@@ -122,8 +122,8 @@ QUANTITIES = {
 
 
 def conventions(kind: str) -> dict[str, str]:
-    """Return the attributes of a product in which users find the units, the box and the origin of time. The result is
-    empty for a product without a flow."""
+    """Return attributes that state the units, the box and the origin of time of a product; empty for a product without
+    a flow."""
     return {**CONVENTIONS, "time_origin": ORIGINS[kind]} if kind in ORIGINS else {}
 
 

@@ -259,7 +259,7 @@ def _is_held_by(path: Path, holder: Holder) -> bool:
 
 
 def _read(path: Path) -> Holder:
-    """Return the job that a lock names. Its name is UNREADABLE if the content is incomplete or cannot be read."""
+    """Return the job that a lock names. The job's name is UNREADABLE if the lock is incomplete or cannot be read."""
     try:
         return Holder(**json.loads(path.read_text()))
     except (FileNotFoundError, NotADirectoryError):

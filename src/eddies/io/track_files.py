@@ -82,8 +82,7 @@ def read_tracks(path: str | Path, layout: str | None = None, group: str | None =
     Parameters
     ----------
     layout : one of LAYOUTS; None to find it by the name and content of the file.
-    group : name of the group of particles of an H5MD file, or of the trajectory of a LagrangeBench file; needed if
-        the file has several.
+    group : name of the group of particles (H5MD) or of the trajectory (LagrangeBench); needed if the file has several.
     interval : time between frames, for an NPZ file without times.
 
     Raises:

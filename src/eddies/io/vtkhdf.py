@@ -75,7 +75,7 @@ def write_points(path: Path, trajectory: Trajectory, provenance: Mapping[str, An
 def _create(path: Path, kind: str, frames: int, layout: Layout,
             provenance: Mapping[str, Any]) -> Iterator[h5py.Group]:
     """Create a file and yield its group VTKHDF, which has the empty datasets of `layout`. `kind` is VTK's name for the
-    type of the data, and `frames` is their number."""
+    type of the data, and `frames` is the number of frames."""
     within = {f"VTKHDF/{name}": dataset for name, dataset in layout.items()}
     with create_export(path, within, provenance, STEP_BYTES * frames) as file:
         root = file["VTKHDF"]

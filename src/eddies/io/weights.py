@@ -29,7 +29,7 @@ def save_weights(comm: MPI.Comm, path: str | Path, kind: str, description: Mappi
                  tensors: Mapping[str, np.ndarray], provenance: Mapping[str, Any],
                  tables: Mapping[str, Mapping[str, np.ndarray]] | None = None) -> None:
     """Write rank 0's tensors, a description and small tables as one product of this `kind`; collective. The description
-    must be possible to write as JSON.
+    holds only values that JSON can store.
 
     Raises ProductError on all ranks if the file cannot be written or a tensor is not finite.
     """

@@ -1,4 +1,4 @@
-"""Copies before and after the one-dimensional passes of a slab transform.
+"""Copies before and after the one-dimensional Fourier transforms on a slab.
 
 Along an axis of `cells` points a transform keeps the modes 0 ... K at the beginning of its array and -K ... -1 at the
 end. The gap between them stays zero. Arrays that are used many times are `Described` once, because numpy takes long
@@ -16,7 +16,7 @@ from eddies.kernels.library import ADDRESS, INT, NUMBER, library, members, requi
 
 
 class Blocks(ctypes.Structure):
-    """Blocks (components, planes, lines, width), the successive parts of one array along axis 1 or 2."""
+    """Blocks that are successive parts of one array (components, planes, lines, width) along axis 1 or 2."""
 
     _fields_ = members(INT, "ranks planes lines width") + members(ADDRESS, "addresses starts")
 
@@ -155,8 +155,8 @@ class PlaneCopies(_Copies):
             yield
 
     def unpack(self, rows: Described, blocks: Blocks, component: int, planes: slice) -> None:
-        """Store the modes of some `planes`, found in the output `rows` of the transform along y, in a component of
-        blocks. The stored values are twice the modes."""
+        """Store the modes of some `planes` in a component of the blocks. The modes are in `rows`, the output of the
+        transform along y. The stored values are twice the modes."""
         self._unpack(ctypes.byref(blocks), component, planes.start, planes.stop - planes.start, self._cells,
                      rows.shape[-1], rows.address)
 

@@ -43,8 +43,8 @@ class Formulas:
     def advection(self, fields: np.ndarray, viscosity: float, out: np.ndarray) -> None:
         """Write -u.grad u + 2 nu (S - 1/3 div u).grad s and -u.grad s to `out` (4, ...).
 
-        u is the velocity, S the rate of strain, s the logarithm of the density and nu the `viscosity`. `fields` (15,
-        ...) holds the vector u, then the derivatives of (u, v, w, s) along x, along y and along z.
+        u is the velocity, S the rate of strain, s the logarithm of the density and nu the `viscosity`.
+        `fields` (15, ...) holds the vector u, then the derivatives of (u, v, w, s) along x, along y and along z.
         """
         size = fields[0].size
         self._advection(size, *self._place(fields, 15, size), viscosity, *self._place(out, 4, size))

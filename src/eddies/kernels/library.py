@@ -78,8 +78,8 @@ def load(instruction_set: str) -> ctypes.CDLL:
 def share_threads() -> None:
     """Make kernels, and torch if it is loaded later, use the OpenMP runtime of pyfftw's wheel.
 
-    Otherwise the threads of two runtimes wait for each other on the same cores; a step of the direct simulation then
-    took twenty times as long.
+    Otherwise the threads of two runtimes wait for each other on the same cores. A step of the direct simulation then
+    takes twenty times as long.
     """
     maps = Path("/proc/self/maps")
     if threads() == 1 or not maps.exists():
@@ -96,7 +96,7 @@ def share_threads() -> None:
 def keep_freed_memory() -> None:
     """Keep freed memory in this process instead of returning it to the system.
 
-    Otherwise the system spent a sixth of the wall time on new pages of memory, in a run of 32^3 particles with kriging.
+    Otherwise new pages of memory take wall time: a sixth of it in a run of 32^3 particles with kriging.
     Does nothing if the user has set MALLOC_... variables, or with a C library other than glibc.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
@@ -112,8 +112,7 @@ def members(kind: type, names: str) -> list[tuple[str, type]]:
 
 
 def address(array: np.ndarray) -> int:
-    """Return the address of the first element. The caller keeps the array alive until the call of the library has
-    ended."""
+    """Return the address of the first element. The caller keeps the array until the library's function returns."""
     return array.ctypes.data
 
 

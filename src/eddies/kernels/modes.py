@@ -18,6 +18,7 @@ class ModePasses:
     """The operations of one iteration of conjugate gradients on modes (3, kz, ky, kx).
 
     The inner product <a, b> of real fields is a sum over the modes of this rank. Each mode counts `multiplicity` times.
+    In the methods, `inverse` (kz, ky, kx) holds the factors of the preconditioner.
 
     Parameters
     ----------
@@ -39,8 +40,7 @@ class ModePasses:
         self._weights = _Weights(z, y, x, *map(address, self._arrays))
 
     def apply(self, given: np.ndarray, modes: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return two results: I = P (scale * given) + penalty * modes, and <I, modes>. P projects on solenoidal
-        modes."""
+        """Return I = P (scale * given) + penalty * modes, and <I, modes>. P projects on solenoidal modes."""
         applied = np.empty_like(modes)
         return applied, self._call("modes_image", ctypes.c_double, [], [given, modes, applied])
 

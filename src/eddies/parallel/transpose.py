@@ -53,7 +53,8 @@ class Transpose:
 
 
 def _blocks(shapes: list[tuple[int, ...]], rank: int, own: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return a flat buffer for messages, and its blocks of the given shapes. The block of `rank` is `own` instead."""
+    """Return a flat buffer for messages, and its parts as blocks of these shapes. In place of a part, the block of
+    `rank` is `own`."""
     sizes = [0 if index == rank else int(np.prod(shape)) for index, shape in enumerate(shapes)]
     flat = np.empty(sum(sizes), own.dtype)
     parts = np.split(flat, np.cumsum(sizes)[:-1])
