@@ -1,4 +1,4 @@
-"""The commands as Python functions. Each takes a scene, or the name or path of a scene, and returns when it is done.
+"""The commands as Python functions. Each takes a scene, or the name or path of one, and returns when its work is done.
 
 All ranks call a function together. Only this module and `cli` use MPI.COMM_WORLD, the communicator of the job.
 """
@@ -44,8 +44,8 @@ def run(scene: Scene | str | Path, *, stages: Sequence[str] | None = None, outpu
     ----------
     stages : names such as "dns" and "train-kernel"; run in the order of the pipeline. None: all stages of the scene.
     output : the run directory; None: runs/NAME, where NAME is the name of the scene.
-    overwrite : replace products and checkpoints that were made with other settings; if False, they are an error.
-        Complete products of the same settings are always kept.
+    overwrite : if True, products and checkpoints that were made with other settings are replaced; if False, they are an
+        error. Complete products of the same settings are always kept.
     variants : the variants to run; empty for all.
     comm : the communicator; None for all ranks of the job.
 

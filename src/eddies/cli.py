@@ -146,7 +146,7 @@ def catch_signals() -> list[int]:
         received.append(number)
         if number != signal.SIGUSR1:
             signal.signal(number, signal.SIG_DFL)
-        if number == signal.SIGINT and sys.__stderr__ is not None:  # if closed, another file may have its number
+        if number == signal.SIGINT and sys.__stderr__ is not None:  # None: closed, so another file may have its number
             with contextlib.suppress(OSError):  # a closed pipe or a full disk must not end the run
                 os.write(sys.__stderr__.fileno(), STOPPING)
 

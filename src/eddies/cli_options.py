@@ -119,7 +119,7 @@ def directory(text: str) -> Path:
 
 
 def positive(text: str) -> float:
-    """Return a positive number that the command line gives as `text`."""
+    """Return the positive number that a text of the command line gives."""
     value = float(text)
     if not value > 0:
         raise argparse.ArgumentTypeError(f"{text}: must be larger than 0")

@@ -179,8 +179,8 @@ def open_run(path: str | Path) -> StoredRun:
 
 
 def variant_directory(path: Path, name: str) -> Path:
-    """Return the directory of a variant in the run directory `path`. If the scene has realisations, it is that of the
-    first one. Raises SceneError if the scene has no such variant."""
+    """Return the directory of a variant in the run directory `path`; if the scene has realisations, the directory of
+    the variant on the first realisation. Raises SceneError if the scene has no such variant."""
     from eddies.workflows.variants import rollouts
     scene = load_scene(path / "scene.toml")
     scene.check_variants([name])

@@ -253,8 +253,9 @@ def check_training(training: Training, tracers: Tracers | None, kernel: Kernel |
 
 
 def check_simulation(simulation: Simulation, tracers: Tracers, seen: float) -> Problems:
-    """Yield a problem if the frame interval is not a multiple of the tracers' frame interval and, if the integrator
-    needs this, of the step. Yield a problem, too, if `start` is missing and training uses the whole ground truth.
+    """Yield a problem if the frame interval is not a whole multiple of the tracers' frame interval; if it is not one of
+    the step, and the integrator gives no values between steps; or if `start` is missing, and training uses the whole
+    ground truth.
 
     `seen` is the fraction of the ground truth that training uses.
     """

@@ -11,9 +11,9 @@ MOST_COURANT = 1.4
 class Scheme:
     """A time stepping scheme that a scene can name.
 
-    `nodes` and `weights` are the coefficients c and b of a Runge-Kutta scheme; other schemes have none. Each of its
-    stages starts at the beginning of the step and uses only the rates of the stage before. For `angle` and `iterations`
-    see docs/closure.md.
+    `nodes` and `weights` are the coefficients c and b of a Runge-Kutta scheme; other schemes have none. Each stage of a
+    Runge-Kutta scheme starts at the beginning of the step and uses only the rates of the stage before. For `angle` and
+    `iterations` see docs/closure.md.
     """
 
     name: str

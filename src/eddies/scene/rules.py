@@ -47,7 +47,7 @@ class Rule:
     ----------
     kind : type of the value, or of each entry of a list: float, int, bool or str.
     about : meaning of the key in one line.
-    bounds : interval of a number.
+    bounds : interval of the allowed numbers.
     words : allowed strings. If `kind` is a number, they are allowed besides numbers. If `kind` is str and there are no
         words, any string is allowed.
     paths : whether the import path "module:name" of a user's own class is allowed too.

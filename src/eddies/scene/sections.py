@@ -45,7 +45,7 @@ class Flow(Section):
 
     @property
     def components(self) -> int:
-        """Number of scalar fields in the state: three of the velocity, and the density of a compressible fluid."""
+        """Number of scalar fields in the state: three for the velocity, and one for the density if it varies."""
         return 4 if self.compressible else 3
 
     @property
@@ -61,7 +61,7 @@ class Flow(Section):
 
 @dataclass(frozen=True)
 class InitialFlow:
-    """Properties of an initial flow that are known before it is made."""
+    """Properties of an initial flow that are known before the flow is made."""
 
     keys: tuple[str, ...] = ("amplitude", "peak_wavenumber", "wavenumber", "path", "state")  # its keys in [initial]
     # The root mean square of the speed, and the largest sum of the magnitudes of the three velocity components, both
@@ -410,10 +410,10 @@ class Reconstruction(Section):
     def resolving(self, tracers: Tracers, filtered: bool) -> Tracers:
         """Return `tracers` with so many particles that one frame of them would resolve the modes of the reconstruction.
 
-        The number of particles changes only if the method is "memory" and the flow is unfiltered: it is then eight
-        times that of `tracers`, because the memory keeps modes that `tracers` determine only over several frames
-        (docs/tracks.md). If the tracks are `filtered`, further modes gain little, because the removal of the filter
-        amplifies their errors.
+        The number of particles changes only if the method is "memory" and the tracks are not `filtered`: it is then
+        eight times that of `tracers`, because the memory keeps modes that `tracers` determine only over several frames
+        (docs/tracks.md). With filtered tracks further modes gain little, because the removal of the filter amplifies
+        their errors.
         """
         return tracers.with_count(8 * tracers.particles) if self.method == "memory" and not filtered else tracers
 
@@ -471,7 +471,7 @@ class Training(Section):
 
     @property
     def steps_in_all(self) -> int:
-        """Number of optimiser steps, including the steps through horizons."""
+        """Number of optimiser steps, including those of [training.horizons]."""
         return self.steps + (self.horizons.steps * len(self.horizons.frames) if self.horizons else 0)
 
     @property
@@ -542,7 +542,7 @@ class Simulation(Section):
 
     @property
     def schemes(self) -> tuple[str, ...]:
-        """The integrators among which a converged step is sought."""
+        """The integrators with which the search for a converged step runs."""
         return (self.integrator,) if self.integrator else tuple(SCHEMES)
 
     @property

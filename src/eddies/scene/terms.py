@@ -73,7 +73,7 @@ class TermSettings(Section):
     gives : its outputs, any of "acceleration", "density" (a contribution to it), "density_rate" and "shift_velocity".
     learns_through_horizons : whether only training through several steps of the simulation fits its parameters.
     viscous : whether it needs the viscosity of the fluid.
-    pair_cost : ratio of the cost of a pair to its cost in a plain sum; `eddies check` estimates times with it.
+    pair_cost : cost of a pair, relative to its cost in a plain sum over pairs; `eddies check` estimates times with it.
     damps_by : name of its parameter with damping rates by wavenumber, which a coarse grid can use; empty without one.
     too_long : text of the error for a step beyond `longest_step`; it may contain {name}, {longest} and {integrator}.
     """
@@ -260,7 +260,7 @@ class Continuity(TermSettings):
 
     @property
     def learns_through_horizons(self) -> bool:  # type: ignore[override]
-        """Whether the term has a learned parameter: the coefficient of a diffusion above 0."""
+        """Whether the term has a learned parameter: the coefficient of the diffusion, if `diffusion` is above 0."""
         return self.diffusion > 0
 
 
@@ -300,7 +300,7 @@ class TransportVelocity(TermSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class FilteredEquations(TermSettings):
-    """The filtered equations of motion with derivatives from neighbours, by kriging."""
+    """The filtered equations of motion, whose derivatives kriging estimates from neighbours."""
 
     word, viscous = "filtered-equations", True
     pair_cost = 6.0
@@ -341,7 +341,7 @@ RESOLVED = ("pressure", "stress", "viscosity", "damping", "relaxation")
 
 def _published(basis: str, hidden: tuple[int, ...]) -> dict[str, Mapping[str, Any]]:
     """Return the terms of Eq. 3 of the paper with their settings: the networks of force and density, and the term Pi in
-    the equations of both.
+    the equations of velocity and density.
 
     `hidden` holds the widths of the networks' layers. Settings that the paper does not state are those of its public
     code.

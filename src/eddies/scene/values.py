@@ -53,7 +53,7 @@ class Section:
 
     Attributes
     ----------
-    _holder : name of the field that holds the sections [section.NAME] by NAME; empty for a class without them.
+    _holder : name of the field that maps NAME to the inner section [SECTION.NAME]; empty for a class without them.
     """
 
     _holder: ClassVar[str] = ""
