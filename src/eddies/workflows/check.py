@@ -21,7 +21,7 @@ log = logging.getLogger("eddies")
 
 TURBULENCE_KEYS = ("velocity_rms", "dissipation_rate", "reynolds_lambda", "turnover_time", "kolmogorov_length",
                    "kolmogorov_time")
-Foreseen = tuple[float | None, Storage]  # wall time, memory and disk of a stage of a scene
+Foreseen = tuple[float | None, Storage]  # wall time of a stage, and its memory and disk space
 
 
 def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
@@ -47,7 +47,7 @@ def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
 
 
 def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
-    """Return all estimates, with the keys that docs/check.md describes; None if unknown. All ranks call it."""
+    """Return all estimates, with the keys that docs/check.md describes. An unknown value is None. All ranks call it."""
     expected, tracers, k_max = estimate(scene), scene.tracers, scene.flow.largest_wavenumber
     rollout_of = {name: estimate(each).rollout for name, each in (scene.variant or {scene.name: scene}).items()}
     planned = steps(scene, scene.stages_of_all, scene.directory)
@@ -93,7 +93,7 @@ def row(stage: str, variant: str | None, here: Sequence[Foreseen], most_ranks: i
         there: Sequence[Foreseen]) -> dict[str, Any]:
     """Return a row of `stage_costs`: the cost of a stage for several scenes.
 
-    `here` is the cost of each scene on the ranks of this job. `there` is the cost on `most_ranks`, the largest number
+    `here` is the cost for each scene on the ranks of this job. `there` is the cost on `most_ranks`, the largest number
     of ranks that the stage can use; it gives `least_seconds` and `least_memory`. Wall times and `disk` are sums over
     the scenes; `memory`, in bytes per rank, is the largest value. The stage leaves `disk` bytes, and removes `scratch`
     bytes at its end.
@@ -109,7 +109,7 @@ def row(stage: str, variant: str | None, here: Sequence[Foreseen], most_ranks: i
 
 
 def lines(found: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield the estimates as text, each as a pair of subject and line."""
+    """Yield the estimates as text. Each item is a pair of a subject and a line."""
     for key, value in found.items():
         if key == "limits":
             yield from ((key, f"{ranks}: {reason}") for reason, ranks in value.items())
@@ -150,5 +150,5 @@ def name_of(row: Mapping[str, Any]) -> str:
 
 
 def wall_time(seconds: float | None) -> str:
-    """Wall time as text."""
+    """Return a wall time as text."""
     return "not known" if seconds is None else duration(seconds)

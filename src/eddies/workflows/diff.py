@@ -1,4 +1,4 @@
-"""`eddies diff`: print the settings, and the numbers of the reports, in which two runs differ."""
+"""`eddies diff`: print the settings in which two runs differ, and the numbers in which their reports differ."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ METRICS = Path("report") / "metrics.json"
 
 
 def run(one: Path, other: Path, comm: Comm) -> None:
-    """Print a line for each setting and number that differs; all ranks call it."""
+    """Print a line for each setting and each number that differs between two runs; all ranks call it."""
     lines = in_files(comm, one, lambda: diff_lines(one, other))
     if comm.rank == 0:
         sys.stdout.write("".join(f"{line}\n" for line in lines))
 
 
 def diff_lines(one: Path, other: Path) -> list[str]:
-    """Lines of two tables of differences: settings (defaults included), and numbers with the ratio second / first."""
+    """Return the lines of two tables of differences: of the settings, defaults included, and of the numbers. The second
+    table also has the ratio second / first."""
     runs = one, other
     settings = [dict(dotted(tomllib.loads(load_scene(path / "scene.toml").to_toml()))) for path in runs]
     lines = [*table("setting", settings, runs), ""]
@@ -37,7 +38,11 @@ def diff_lines(one: Path, other: Path) -> list[str]:
 
 
 def table(title: str, columns: list[dict[str, Any]], runs: tuple[Path, Path], ratio: bool = False) -> list[str]:
-    """Lines of a table of the values that differ between two runs ("-" if missing), or one line if none differs."""
+    """Return the lines of a table of the values that differ between two runs, or one line if none differs.
+
+    `title` names the kind of the values, and `columns` holds the values of each run by key. A missing value is shown as
+    "-". If `ratio` is true, a last column has the ratio second / first.
+    """
     rows = [(title, *map(str, runs), "ratio" if ratio else "")]
     for key in dict.fromkeys([*columns[0], *columns[1]]):
         first, second = (column.get(key) for column in columns)

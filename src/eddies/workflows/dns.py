@@ -44,8 +44,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     truth of the run directory then has no tracers.
 
     The flow is first spun up ([spin_up]). The forcing ends at the release of the tracers, unless [tracers] forced is
-    true. The run continues from the newest checkpoint with the same settings; only the duration of the run may
-    differ. Without sets, the last state is kept as a checkpoint, and the product holds the frames up to this state.
+    true. The run continues from the newest checkpoint with the same settings; only the duration of the run may differ.
+    Without sets, the last state is kept as a checkpoint, and the product holds the frames up to this state.
 
     Raises SceneError if the checkpoint is later than the end of the run, and Stopped, after a checkpoint, if `stop`
     requests it.
@@ -71,7 +71,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         log.info("dns: continues from step %d, time %.4g", flow.clock.steps, flow.clock.time)
     provenance = {**stage_provenance(scene, "dns"), "course": course, "duration": scene.duration}
     if same_course and saved is not None and scene.tracers is not None:
-        provenance["id"] = origin["id"]  # its frames stay, so products made from them stay valid
+        provenance["id"] = origin["id"]  # the frames so far do not change, so products made from them stay valid
     sets = scene.tracer_sets
     with ExitStack() as held:
         for name in sets:
@@ -100,7 +100,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         for name, own in sets.items():
             path = directory / name / product.name
             if in_files(comm, path, partial(product_fingerprint, path)) == stage_fingerprint(own, "dns"):
-                continue  # products made from it stay valid
+                continue  # it is kept, so products made from it stay valid
             in_files(comm, path, partial(prepare_set, path.parent, own.to_toml()))
             with create_product(comm, path, "ground_truth", stage_provenance(own, "dns")) as part:
                 write_tracers(part, tracers, name, parts, own.forcing)
@@ -118,13 +118,14 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
 
 
 def prepare_set(directory: Path, text: str) -> None:
-    """Write the scene of a set of tracers to scene.toml in its directory, unless there is such a file."""
+    """Write the scene of a set of tracers to scene.toml in its directory, unless this file exists."""
     if not (directory / "scene.toml").exists():
         write_files({directory / "scene.toml": text})
 
 
 def write_tracers(file: File, tracers: TracerRun, name: str, parts: FrameSegments, forcing: Forcing | None) -> None:
-    """Write the frames, fields and spectra of a set of tracers, and any forcing after the release; collective."""
+    """Write the frames, fields and spectra of the set of tracers `name`; collective. `parts` holds the frames so far.
+    If the flow is forced after the release, `forcing` is written, too."""
     parts.assemble(file, series_of(name))
     if tracers.flow.fluid.forcing is not None:
         file.create_group("forcing").attrs.update(asdict(forcing))
@@ -143,7 +144,7 @@ def write_flow(file: File, flow: FlowRun, scales: Mapping[str, float], spin_up: 
 
 
 def holds_frames(comm: Comm, product: Path, count: int) -> bool:
-    """Whether a ground truth exists and has exactly `count` frames; collective."""
+    """Return whether a ground truth exists and has exactly `count` frames; collective."""
     with suppress(ProductError), open_product(comm, product, "ground_truth") as file:
         return len(Trajectory(file, "tracers").times) == count
     return False
@@ -195,7 +196,8 @@ def spin_up(flow: FlowRun, turnovers: float, time: Time) -> None:
 
 
 def stationary_span(settings: SpinUp, history: FlowHistory) -> dict[str, float]:
-    """Start and end time of the last `stationary` turnovers of the spin-up, over which statistics are averaged."""
+    """Return the start and the end of the time over which statistics are averaged: the last `stationary` turnovers of
+    the spin-up."""
     turned, times = (np.array([row[name] for row in history.rows]) for name in ("turnovers", "time"))
     last = int(np.argmax(turned >= settings.turnovers))
     first = int(np.argmax(turned >= turned[last] - settings.stationary))
@@ -214,6 +216,6 @@ def write_final_fields(file: File, flow: FlowRun) -> None:
 
 
 def scales_of(sample: dict[str, float]) -> dict[str, float]:
-    """The entries of a sample that describe the flow, without those that describe the run."""
+    """Return the entries of a sample that describe the flow, without the entries that describe the run."""
     of_the_run = ("time", "turnovers", "time_step", "seconds_per_step")
     return {name: value for name, value in sample.items() if name not in of_the_run}

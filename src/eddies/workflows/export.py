@@ -1,4 +1,4 @@
-"""`eddies export`: rank 0 writes each series of fields or particles of a run to a file for other programs."""
+"""`eddies export`: write each series of fields or particles of a run to a file for other programs, on rank 0."""
 
 from __future__ import annotations
 
@@ -59,7 +59,8 @@ def _export(run_directory: Path, output: Path, alone: Comm, layout: str) -> None
 
 @contextmanager
 def _opened(kind: str, run_directory: Path, alone: Comm) -> Iterator[tuple[Series, Provenance]]:
-    """Open the fields and particles of a product. Those of a rollout may be computed instead of stored."""
+    """Open the fields and particles of a product, and its provenance. Those of a rollout that are not stored are
+    computed when they are read."""
     if kind == "rollout":
         from eddies.workflows.rollout.measured import open_rollout  # needs torch
         with open_rollout(run_directory, alone) as measured:
@@ -71,7 +72,8 @@ def _opened(kind: str, run_directory: Path, alone: Comm) -> Iterator[tuple[Serie
 
 
 def _cube_of(series: Any) -> tuple[float, np.ndarray]:
-    """Edge and lower corner of the cube; for fields reconstructed from tracks, in the unit and axes of the tracks."""
+    """Return the edge and the lower corner of the cube. For fields reconstructed from tracks, both are in the unit and
+    the axes of the tracks."""
     if isinstance(series, FieldSeries) and "about" in series.file:
         about = series.file["about"].attrs
         return BOX_LENGTH * float(about["length_unit"]), -about["corner"]
@@ -79,7 +81,10 @@ def _cube_of(series: Any) -> tuple[float, np.ndarray]:
 
 
 def _write(output: Path, case: str, group: str, series: Any, provenance: Provenance, data_set: bool) -> bool:
-    """Write a series as a VTKHDF file, or particles as a data set; returns whether it was written."""
+    """Write the series with the name `case` as a VTKHDF file or, if `data_set`, particles as a LagrangeBench data set.
+
+    Returns whether it was written.
+    """
     if not len(series.times):
         log.info("export: %s is left out: it has no frames", case)
         return False

@@ -1,16 +1,18 @@
 """Find the cheapest converged time step of a rollout, by short rollouts on the ground truth.
 
 The rule is the same for every method. The steps of an integrator differ by factors of two. Each step is compared with
-half of it: d is the rms difference of the final velocities, and e is the error of the rollout with the half step. The
-whole step is assumed to add an independent error d, so that its error squared is e^2 + d^2. The step has converged if d
-is below a tolerance: a fifth of e, so that e^2 + d^2 < (1.02 e)^2, or 1e-3 of the velocity if larger. A step must
-also converge on all ground truths in [simulation] confirmed_on. For coarse grids a Courant number takes the place of
-the step. The cheapest converged step is stored.
+half of it. The distance d is the rms difference between the final velocities of these two rollouts. The error e is the
+rms difference between the final velocity with the half step and the true one. Both are divided by the rms of the true
+velocity. The whole step is assumed to add an independent error d, so the square of its error is e^2 + d^2. The step has
+converged if d is below a fifth of e, so that e^2 + d^2 < (1.02 e)^2, or if d is below 1e-3. A step must also converge
+on all ground truths in [simulation] confirmed_on. For coarse grids a Courant number takes the place of the step. The
+cheapest converged step is stored.
 
 The steps of the first integrator are halved until one has converged. The search with each other integrator starts at
-the shortest step that needs no more evaluations than the best step so far. It doubles the step while the final velocity
-differs by at most the tolerance from a reference, the rollout with half the best step. It ends at once if the shortest
-step already differs more, because longer steps are less accurate.
+the shortest step that needs no more evaluations than the best step so far. The reference is the rollout with half the
+best step. The step is doubled as long as the final velocity differs from that of the reference by at most the
+tolerance. If already the shortest step differs by more, this search ends at once, because longer steps are less
+accurate.
 """
 
 from __future__ import annotations
@@ -45,7 +47,7 @@ from eddies.workflows.run_directory.fingerprints import stage_provenance
 log = logging.getLogger("eddies")
 
 TURNOVERS = 0.25  # duration of a short rollout in turnover times
-# Largest share of the error that a step may add, and relative change of the velocity that is always allowed.
+# Largest share of the error that a step may add, and the relative change of the velocity that is always allowed.
 LARGEST_ERROR_SHARE, LEAST_TOLERANCE = 0.02, 1e-3
 # Largest number of halvings of a step.
 HALVINGS = 12
@@ -57,12 +59,12 @@ CHEAPER = 0.9
 class Stretch:
     """The part of a ground truth that short rollouts cover, in whole frame intervals of the rollout.
 
-    It starts at the first frame after frame 0 that has the unfiltered flow, or else at frame 1.
+    It starts at the first frame after frame 0 that has the unfiltered flow, or at frame 1 if there is none.
 
     Parameters
     ----------
     interval, every : the frame interval of the rollout, in units of time and in frames of the ground truth.
-    name : words for the log, empty if there is one ground truth.
+    name : words for the log that name the ground truth; empty if there is only one.
     """
 
     def __init__(self, truth: GroundTruth, interval: float, every: int, name: str) -> None:
@@ -78,18 +80,18 @@ class Stretch:
         self.end = truth.block(self.frame + count * every, ("velocity",))["velocity"]
 
     def distance(self, one: np.ndarray, other: np.ndarray) -> float:
-        """Rms of the difference of two final velocities, divided by the rms of the true final velocity; collective."""
+        """Return the rms difference of two final velocities, divided by the rms of the true one; collective."""
         return relative_error(self.truth.decomposition.comm, torch.from_numpy(one.astype(np.float64) - other),
                               torch.from_numpy(self.end))
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A short rollout with a step.
+    """A short rollout with one time step.
 
     Parameters
     ----------
-    stretch : the part of a ground truth that it covers.
+    stretch : the part of a ground truth that the rollout covers.
     seconds : wall time per turnover time of the flow; nothing is stored.
     velocity : the final velocity in order of id; None if the rollout failed.
     """
@@ -105,14 +107,16 @@ class Trial:
         return np.nan if self.velocity is None else self.stretch.distance(self.velocity, self.stretch.end)
 
     def distance(self, other: Trial | None) -> float:
-        """Distance of the final velocities of two trials; nan if the other is missing or one failed. Collective."""
+        """Return the distance of the final velocities of two trials; collective. It is nan if the trial `other` is
+        missing, or if one of the two failed."""
         if other is None or other.velocity is None or self.velocity is None:
             return np.nan
         return self.stretch.distance(self.velocity, other.velocity)
 
     @property
     def tolerance(self) -> float:
-        """The distance within which twice this step has converged: sqrt(1.02^2 - 1) times `error`, at least 1e-3."""
+        """The rollout with twice this step has converged if its distance to this one is less than this number:
+        sqrt(1.02^2 - 1) times `error`, at least 1e-3."""
         return max(math.sqrt((1 + LARGEST_ERROR_SHARE) ** 2 - 1) * self.error, LEAST_TOLERANCE)
 
 
@@ -123,8 +127,8 @@ class Ladder:
     Parameters
     ----------
     tried : function that runs the rollout on a stretch with a step. It is called when a rung is first needed.
-    stretches : one for each ground truth. The search is on the first; a step must converge on the others too.
-    integrator, first, evaluations : name, longest step, and evaluations of the rates in a step.
+    stretches : one for each ground truth. The search uses the first. A step must converge on the others, too.
+    integrator, first, evaluations : name of the integrator, longest step, and evaluations of the rates in a step.
     """
 
     def __init__(self, tried: Callable[[Stretch, TimeStep], Trial], stretches: Sequence[Stretch], integrator: str,
@@ -134,7 +138,7 @@ class Ladder:
         self.trials: dict[int, Trial] = {}  # by rung
 
     def size(self, rung: int) -> float:
-        """The step of a rung."""
+        """Return the step of a rung."""
         return self._first / 2**rung
 
     def __getitem__(self, rung: int) -> Trial:
@@ -143,11 +147,12 @@ class Ladder:
         return self.trials[rung]
 
     def difference(self, rung: int) -> float:
-        """Distance between the rollout on a rung and the one with twice its step; nan if the latter was not tried."""
+        """Return the distance between the rollout on a rung and the one with twice its step; nan if the rollout with
+        twice the step was not tried."""
         return self[rung].distance(self.trials.get(rung - 1))
 
     def table(self) -> dict[str, list[float]]:
-        """Columns of the table of trials. The first row is the longest step."""
+        """Return the columns of the table of trials. The first row belongs to the longest step."""
         trials = {rung: self.trials[rung] for rung in sorted(self.trials)}
         return {"size": [trial.step.size for trial in trials.values()],
                 "seconds_per_turnover": [trial.seconds for trial in trials.values()],
@@ -155,7 +160,7 @@ class Ladder:
                 "difference": [self.difference(rung) for rung in trials]}
 
     def converged(self, rung: int) -> bool:
-        """Whether the step of a rung has converged on all ground truths."""
+        """Return whether the step of a rung has converged on all ground truths."""
         whole, half = self[rung], self[rung + 1]
         if not whole.distance(half) < half.tolerance:
             return False
@@ -168,7 +173,7 @@ class Ladder:
 
 
 def cheapest(ladders: Sequence[Ladder]) -> tuple[Ladder, int] | None:
-    """The ladder and the rung of the cheapest converged step; None if no step converges."""
+    """Return the ladder and the rung of the cheapest converged step; None if no step converges."""
     best: tuple[Ladder, int] | None = None
     for ladder in ladders:
         if best is None:
@@ -180,7 +185,8 @@ def cheapest(ladders: Sequence[Ladder]) -> tuple[Ladder, int] | None:
 
 
 def cheaper(ladder: Ladder, best: Ladder, of_best: int) -> int | None:
-    """The rung of the longest step in `ladder` that converges and is cheaper than rung `of_best` of `best`, or None."""
+    """Return the rung of the longest step in `ladder` that converges and is cheaper than the rung `of_best` of `best`;
+    None if there is none."""
     most = best.evaluations / best.size(of_best)
     shortest = max((rung for rung in range(HALVINGS) if ladder.evaluations / ladder.size(rung) <= most), default=-1)
     most_seconds = CHEAPER * best[of_best].seconds
@@ -244,7 +250,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
 
 
 def integrators(settings: Simulation, span: float) -> Iterator[tuple[str, float, int]]:
-    """Yield name, longest step and evaluations per step of each integrator to try; `span` is the rollout's duration."""
+    """Yield the name, the longest step and the evaluations in a step of each integrator to try. `span` is the duration
+    of the short rollouts."""
     if settings.on_grid:
         yield "etdrk4", MOST_COURANT, ETDRK4.evaluations
         return
@@ -255,7 +262,10 @@ def integrators(settings: Simulation, span: float) -> Iterator[tuple[str, float,
 
 
 def short_rollout(method: Method, step: TimeStep, stretch: Stretch, stop: StopRequest) -> Trial:
-    """Advance a method through a stretch of the ground truth with this time step; collective. Raises Stopped."""
+    """Advance a method through a stretch of the ground truth, and return the trial; collective.
+
+    `step` is the step with which the method was made. Raises Stopped if a stop is requested.
+    """
     comm, total = stretch.truth.decomposition.comm, stretch.truth.total
     method.frame(0.0)  # the rates at the start, which the first step uses
     began, number, complaint = time.perf_counter(), 0, None

@@ -1,5 +1,7 @@
-"""Problems of a scene, of the machine and of the run directory, found before any work. Each text names the key, its
-value, the reason and a remedy."""
+"""Problems of a scene, of the machine and of the run directory, found before any work.
+
+Each text names the key, its value, the reason and a remedy.
+"""
 
 from __future__ import annotations
 
@@ -31,10 +33,10 @@ from eddies.workflows.ground_truth.scene_flow import given_spectrum, stored_stat
 from eddies.workflows.learned.source import ModelDefinition, read_source
 from eddies.workflows.variants import Step
 
-LARGEST_MACH = 0.3           # turbulent Mach number; relative density fluctuations are about its square
+LARGEST_MACH = 0.3           # turbulent Mach number; the relative density fluctuations are about the square of it
 LEAST_REYNOLDS = 5.0         # Re_lambda above which large scales transfer energy to small ones
-KMAX_ETA = 1.0, 4.0          # least k_max eta that resolves the dissipation; largest that is useful
-MOST_STEPS = 10**9           # steps of a flow or rollout, or frames: a quarter of an hour at a microsecond each
+KMAX_ETA = 1.0, 4.0          # least k_max eta that resolves the dissipation; largest useful k_max eta
+MOST_STEPS = 10**9           # steps of a flow or rollout, or frames: they take a quarter of an hour at 1 us each
 MOST_FORCED = 50             # largest energy that the forcing may add in one step, divided by that of the flow
 LOG_NEGLIGIBLE_ENERGY = -40.0  # logarithm of the share of the energy below which only round-off remains
 # Largest ratio of the turnover time at the release of tracers to the expected one; least Re_lambda for this limit.
@@ -42,22 +44,22 @@ LARGEST_TURNOVER_RATIO, TURBULENT = 3.0, 20.0
 
 
 def free_disk_at(directory: Path, comm: Comm) -> float:
-    """Free bytes on the disk of a directory, which need not exist; all ranks call it."""
+    """Return the free bytes on the disk of a directory; all ranks call it. The directory need not exist."""
     place = next(path for path in (directory, *directory.parents) if path.is_dir())
     return float(on_first_rank(comm, lambda: shutil.disk_usage(place).free))
 
 
 def memory_of_node(comm: Comm) -> float:
-    """Physical memory in bytes of the smallest node; all ranks call it."""
+    """Return the physical memory in bytes of the smallest node; all ranks call it."""
     return float(global_min(comm, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")))
 
 
 def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = math.inf,
              free_disk: float = math.inf) -> tuple[list[str], list[str]]:
-    """Return two lists of problems of the planned steps of a scene; all ranks call it and get the same.
+    """Return two lists of problems of the planned steps of a scene; all ranks call it and get the same lists.
 
-    `eddies run` refuses the scene if the first list is not empty. The second list holds warnings. `memory` is that of a
-    node in bytes, and `free_disk` is in bytes. A value of infinity switches the check off.
+    `eddies run` refuses the scene if the first list is not empty. The second list holds warnings. `memory` is the
+    memory of a node and `free_disk` the free disk space, both in bytes. If one is infinite, it is not checked.
     """
     on_node = node_ranks(comm)
     made = {file for step in planned for file in step.files}
@@ -96,8 +98,10 @@ def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = 
 
 
 def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
-    """Yield each reason why a step cannot work: an unstable or decayed flow; too many steps, frames, ranks or bytes;
-    too few frames; or ground truths of other runs that do not fit. `made` are the files that the planned steps write.
+    """Yield each reason why a step cannot work.
+
+    The reasons are an unstable or decayed flow; too many steps, frames, ranks or bytes; too few frames; and ground
+    truths of other runs that do not fit. `made` are the files that the planned steps write.
     """
     scene, stages, expected = step.scene, step.stages, estimate(step.scene)
     tracers, turbulence, directory = scene.tracers, expected.turbulence, step.links.get("dns", step.directory)
@@ -142,7 +146,7 @@ def _strong_forcing(initial: Initial, forcing: Forcing, time: Time) -> Iterator[
 
 
 def _decay(flow: Flow, tracers: Tracers, turbulence: Turbulence) -> Iterator[str]:
-    """Yield a problem if viscosity stops the flow before the end of the tracer run."""
+    """Yield a problem if viscosity brings the flow to rest before the tracers reach their end."""
     time = tracers.turnovers * turbulence.turnover_time
     exponent = -2 * flow.viscosity * time  # of the decay of energy at the largest scales, |k| = 1
     if exponent < LOG_NEGLIGIBLE_ENERGY and not tracers.forced:
@@ -171,7 +175,7 @@ def _too_many(key: str, value: float | str, step: float, span: float) -> Iterato
 
 
 def _too_few_frames(tracers: Tracers, turnover_time: float, check: Callable[[int], None]) -> Iterator[str]:
-    """Yield a problem if `check` finds too few frames even for the longest possible turnover time."""
+    """Yield a problem if `check` finds too few frames even at the longest possible turnover time."""
     frames = max(math.ceil(LARGEST_TURNOVER_RATIO * tracers.turnovers * turnover_time / tracers.frame_interval), 1) + 1
     if frames <= MOST_STEPS:
         try:
@@ -181,7 +185,7 @@ def _too_few_frames(tracers: Tracers, turnover_time: float, check: Callable[[int
 
 
 def _large_files(needs: Mapping[str, Storage], ranks: int) -> Iterator[str]:
-    """Yield a problem for each product that is too large for rank 0 to write for all ranks."""
+    """Yield a problem for each product that is too large if rank 0 writes it for all ranks."""
     for stage, needed in needs.items():
         if (size := (needed.kept or 0.0) - needed.other_files) > LARGEST_BYTES:
             yield (f"{STAGES[stage].file}: this h5py has no MPI, so rank 0 writes the file for all {ranks} ranks, and "
@@ -189,7 +193,8 @@ def _large_files(needs: Mapping[str, Storage], ranks: int) -> Iterator[str]:
 
 
 def directory_problems(stages: Sequence[str], comm: Comm, directory: Path) -> list[str]:
-    """Problems of a run directory: it cannot be used, or a file or directory in it blocks the name of a product."""
+    """Return the problems of a run directory: it cannot be used, or a file or directory in it blocks the name of a
+    product."""
     def look() -> list[str]:
         if directory.is_dir() and not os.access(directory, os.W_OK | os.X_OK):
             return [f"{directory}: cannot be written; change its permissions, or choose another directory"]
@@ -210,7 +215,8 @@ def directory_problems(stages: Sequence[str], comm: Comm, directory: Path) -> li
 
 def _unfit_files(initial: Initial | None, definition: ModelDefinition | None, name: str, device: str,
                  comm: Comm) -> Iterator[str]:
-    """Yield a problem if the file of the initial flow or of trained weights cannot be used, or if there is no `device`.
+    """Yield a problem if the file of the initial flow or that of trained weights cannot be used, or if `device` does
+    not exist.
 
     `initial` is None if no flow is started, and `definition` is None if no weights are read. `name` is the name of the
     scene.
@@ -276,7 +282,8 @@ def resolution(flow: Flow, turbulence: Turbulence) -> Iterator[str]:
 
 
 def convenient(cells: int) -> int:
-    """An even number, at or just above `cells`, with prime factors up to 7; transforms on other grids are slower."""
+    """Return an even number, equal to `cells` or slightly larger, without prime factors above 7. Transforms on other
+    grids are slower."""
     factors = [2 * 3**threes * 5**fives * 7**sevens for threes in range(4) for fives in range(4) for sevens in range(2)]
     return min(factor << (-(-cells // factor) - 1).bit_length() for factor in factors)
 
@@ -327,7 +334,8 @@ def filter_width(tracers: Tracers, flow: Flow, initial: Initial, forcing: Forcin
 
 
 def unfiltered_quantities(settings: Reconstruction, filtered: bool) -> Iterator[str]:
-    """Yield a warning if quantities of the velocity before the filter are wanted from estimates among neighbours."""
+    """Yield a warning if the pressure or the acceleration is to be reconstructed from neighbours of filtered tracks.
+    Both depend on the velocity before the filter."""
     wanted = [name for name in ("pressure", "acceleration") if name in settings.fields]
     if filtered and settings.of_neighbors and wanted:
         yield (f'[reconstruction] method = "{settings.method}": the {" and ".join(wanted)} will be useless, because '
@@ -344,7 +352,8 @@ def untrained_terms(model: Model, training: Training) -> Iterator[str]:
 
 
 def rollout_steps(settings: Simulation, allowed: float | None, model: Model, units: StepUnits) -> Iterator[str]:
-    """Yield warnings if steps of the particles are longer than a forced flow or a term allows."""
+    """Yield warnings if the steps of the particles are too long. `allowed` is the longest step in the resolved velocity
+    of a forced flow, None without a limit. Each term of the model has a limit of its own."""
     if allowed and settings.longest_step > allowed * (1 + 1e-9):
         yield (f"[simulation] step = {settings.step:g}: is too long for the resolved velocity to follow the flow, so "
                f"the particles will take steps of about {at_most(allowed)}; lower step to {at_most(allowed)}")
@@ -356,9 +365,11 @@ def rollout_steps(settings: Simulation, allowed: float | None, model: Model, uni
 
 
 def beyond_truth(settings: Simulation, tracers: Tracers, seen: float) -> Iterator[str]:
-    """Yield a warning if a rollout ends after its ground truth. `seen` is the fraction that training uses.
+    """Yield a warning if a rollout ends after its ground truth. `seen` is the share of the ground truth that training
+    uses.
 
-    A flow that is forced throughout gives no warning: later frames are compared with the mean of the ground truth.
+    A flow that is forced throughout gives no warning, because later frames are compared with the mean of the ground
+    truth.
     """
     left = (1 - (seen if settings.start is None else settings.start)) * tracers.turnovers
     if settings.turnovers > left * (1 + 1e-9) and not tracers.forced:
@@ -368,7 +379,7 @@ def beyond_truth(settings: Simulation, tracers: Tracers, seen: float) -> Iterato
 
 
 def two_digits(rounded: Callable[[float], int], value: float) -> str:
-    """A number as text with two significant digits; `rounded` is math.floor or math.ceil."""
+    """Return a number as text with two significant digits. `rounded` is math.floor or math.ceil."""
     digit = 10.0 ** (math.floor(math.log10(value)) - 1)
     return f"{rounded(round(value / digit, 9)) * digit:.2g}"
 
@@ -380,9 +391,10 @@ at_least, at_most = partial(two_digits, math.ceil), partial(two_digits, math.flo
 
 
 def check_span(time: Time, span: float, bound: float, tracers: Tracers | None = None) -> None:
-    """Raise SceneError for a flow at rest, or if a time `span` has too many steps or, with `tracers`, too many frames.
+    """Raise SceneError for a flow at rest, or if the time `span` takes too many steps.
 
-    `bound` is the longest step that the present flow allows. A flow at rest has an infinite `span`.
+    With `tracers`, also raise it if this time has too many frames. `bound` is the longest step that the present flow
+    allows. A flow at rest has an infinite `span`.
     """
     if span == math.inf:
         raise SceneError("the flow is at rest, so that it never turns over; set another [initial] kind or amplitude")
@@ -394,10 +406,12 @@ def check_span(time: Time, span: float, bound: float, tracers: Tracers | None = 
 
 def check_ground_truth(path: Path, stages: Sequence[str], simulation: Simulation | None,
                        check: Callable[[int], None], comm: Comm) -> None:
-    """Raise SceneError if a ground truth cannot be used by `stages`; all ranks call it. The reasons are too few frames
-    (found by `check`), a scale that is 0, or a rollout with too many steps."""
+    """Raise SceneError if a ground truth cannot be used by `stages`; all ranks call it.
+
+    The reasons are too few frames, found by `check`; a scale that is 0; and too many steps of the rollout.
+    """
     with open_product(comm, path, "ground_truth") as file:
-        if "particles" not in file:  # measured tracks, none of them in all frames; only fields are made
+        if "particles" not in file:  # measured tracks of which none is in all frames; only fields are made from them
             return
         check(len(Trajectory(file, "tracers").times))
         if {"train", "simulate"} & {*stages}:

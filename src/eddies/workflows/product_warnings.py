@@ -15,7 +15,7 @@ from eddies.workflows.run_directory.work import changed_settings, of_other_setti
 
 Provenance = Mapping[str, Any]
 
-# Columns of a training history with a number for every step. Other columns are NaN in steps that do not compute them.
+# Columns of a training history with a number in every step. Other columns are NaN in steps that do not compute them.
 COLUMNS_OF_ALL_STEPS = "step", "phase", "seconds", "loss", "learning_rate", "gradient_norm"
 MOST_NAMED = 4  # largest number of places in a file that a warning names
 
@@ -50,8 +50,8 @@ def changed_truths(origin: Provenance) -> list[str]:
 
 
 def not_finite(file: File, kind: str) -> str:
-    """Return a sentence that names the numbers of an open product that are not finite; empty if there are none. Only
-    the last frame of a series is read."""
+    """Return a sentence that names the numbers of an open product that are not finite, or an empty text if there are
+    none. Only the last frame of a series is read."""
     places = []
     for place, frame, values in stored_numbers(file):
         table, _, column = place.partition("/")
@@ -75,10 +75,10 @@ def _made(kind: str, origin: Provenance) -> str:
 
 
 def _other(kind: str, origin: Provenance, present: Provenance | None) -> str:
-    """Describe the product of this kind from which another product was made, and which is not in the directory.
+    """Describe the missing product of this `kind`, from which another product in the directory was made.
 
-    `origin` is the provenance of that other product. `present` is the provenance of the product of this kind that is in
-    the directory, or None. With `present` the text names the settings that changed.
+    `origin` is the provenance of that other product. `present` is the provenance of the product of this `kind` that the
+    directory holds now, or None. If there is one, the text names the settings that changed.
     """
     if present is None:
         return f"a {MAKER_OF[kind].file} that is not here"

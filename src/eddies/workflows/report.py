@@ -1,7 +1,7 @@
-"""The report of a run: pages with the paper's figures, made from the products of the run, and the numbers as JSON.
+"""The report of a run: pages with the figures of the paper, and a file with the numbers as JSON.
 
-Every product is optional: a page has sections for the products that exist. All ranks measure a rollout together.
-Each page is made, drawn and written by one rank.
+Both are made from the products of the run. Every product is optional: a page has sections for the products that exist.
+All ranks measure a rollout together. Each page is made, drawn and written by one rank.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ SIMULATION = "dns_seconds_per_turnover"
 SOURCE_OF_TRACKS = ("{in_file} measured tracks from {file}, on average {mean_count:.0f} in a frame; {complete} are in "
                     "all frames. Fields are reconstructed from them by least squares. The dissipation rate is the "
                     "value of the literature for this velocity and integral scale.")
-MAIN_PAGE = 3  # time to make the main page, and time of a round, divided by the time to make another page
+MAIN_PAGE = 3  # time to make the main page, divided by that of another page; a round takes as long as the main page
 Row = dict[str, Any]
 
 
@@ -67,7 +67,7 @@ class Page:
     """A page of the report, made by one rank.
 
     directory: run directory of the products. seconds: wall seconds by stage. provenance: provenance by kind of product.
-    not_finite: a sentence on each product with numbers that are not finite.
+    not_finite: a sentence on each product with numbers that are not finite. cost: the metrics of cost.
     """
 
     directory: Path
@@ -117,15 +117,16 @@ class Report:
         return next(iter(self.pages))
 
     def measured(self, name: str) -> list[Path]:
-        """Directories of the rollouts of a variant."""
+        """Return the directories of the rollouts of a variant."""
         return list(filter(_has_rollout, self.runs[name] if name else [self.directory]))
 
     def report_of(self, page: Path) -> Path:
-        """The directory of the report about a run directory."""
+        """Return the directory of the report about the run directory `page`."""
         return page / "report" if self.output is None else self.output / page.relative_to(self.directory)
 
     def links(self, page: Path) -> list[tuple[str, str]]:
-        """Titles and relative paths of the other pages. `page` is the directory of the page that links to them."""
+        """Return the titles and relative paths of the other pages. `page` is the directory of the page that links to
+        them."""
         found = [] if page == self.directory else [(f"all of {self.scene_name}", self.directory)]
         found += [(name, where) for name, where in self.pages.items() if where not in (page, self.directory)
                   and not (page == self.directory and name == self.main)]
@@ -138,7 +139,7 @@ def _has_rollout(directory: Path) -> bool:
 
 
 def _plan(directory: Path, chosen: Sequence[str] = (), output: Path | None = None) -> tuple[Scene | None, Report]:
-    """Return the scene of a run directory, None if there is no readable one, and the pages to make.
+    """Return the scene of a run directory and the pages to make. The scene is None if it cannot be read.
 
     The main page shows the first variant in the list `chosen` that was run. If none of them was run, it shows the first
     variant of the scene that was run.
@@ -160,12 +161,13 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: S
     """Write report/index.html, report/figures/*.png and report/metrics.json of a run directory; all ranks call it.
 
     If `output` is given, the files are written there, and the reports of variants in directories below it.
-    The page of a scene with variants begins with the table of the variants. The details of one variant follow: the
-    first in `variants` that was run, or else the first of the scene that was run. Each variant that was run also has a
-    page of its own.
 
-    Raises ProductError if the directory holds no product or a damaged one, or if the report cannot be written;
-    SceneError if `variants` names an unknown variant; Stopped, before any page is written, when `stop` asks for it.
+    The page of a scene with variants begins with the table of the variants. The details of one variant follow: the
+    first variant in `variants` that was run, or else the first variant of the scene that was run. Each variant that was
+    run also has a page of its own.
+
+    Raises ProductError if the directory holds no product or a damaged one, or if the report cannot be written. Raises
+    SceneError if `variants` names an unknown variant, and Stopped, before any page is written, if `stop` requests it.
     """
     directory, stop = Path(directory), stop or StopRequest(comm)
     for problem in directory_problems(("report",), comm, directory) if output is None else ():
@@ -188,7 +190,8 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: S
 
 
 def sections_of(directory: Path, alone: Comm) -> list[Section]:
-    """Return all sections of the main page of a run directory, made by one rank, with figures that are not drawn."""
+    """Make all sections of the main page of a run directory on one rank, and return them. Their figures are not
+    drawn."""
     scene, report = _plan(directory)
     report = replace(report, pages={report.main: report.pages[report.main]})
     made, found = _make(report, alone, alone, StopRequest(alone), draw=False)
@@ -202,7 +205,7 @@ def _make(report: Report, comm: Comm, alone: Comm, stop: StopRequest,
 
     All ranks measure each rollout together, and the rank that makes the variant's page collects the results. Then each
     rank makes its pages, in rounds (`_makers`). A variant has no numbers if one of its rollouts is missing. Raises
-    Stopped when `stop` asks for it, after the rollouts of a variant or after a round.
+    Stopped, after the rollouts of a variant or after a round, if `stop` requests it.
     """
     names = list(report.pages) + [name for name in report.runs if name not in report.pages]
     (makers, rounds), made, found, truths, scanned = _makers(names, comm.size), {}, {}, {}, {}
@@ -240,7 +243,7 @@ def _make(report: Report, comm: Comm, alone: Comm, stop: StopRequest,
 def _makers(names: Sequence[str], ranks: int) -> tuple[dict[str, int], dict[str, int]]:
     """Return two mappings by name of a page: the rank that makes the page, and the round in which this rank makes it.
 
-    The first page is the main page. It takes about as long as three other pages, and so does each round.
+    The first page is the main page. It takes about as long as three other pages; each round takes as long.
     """
     makers, rounds, load = {}, {}, [0] * ranks
     for number, name in enumerate(names):
@@ -252,10 +255,10 @@ def _makers(names: Sequence[str], ranks: int) -> tuple[dict[str, int], dict[str,
 
 def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, scanned: dict[Path, str],
               main: bool) -> Page:
-    """Read the products of a run directory and return its page, with figures that are not drawn.
+    """Read the products of a run directory and return its page. The figures are not drawn.
 
-    scanned: results of `not_finite` by file; new results are added. The main page shows everything. Other pages have
-    fewer figures, and no sections on products that are links to other directories.
+    scanned: results of `not_finite` by file; new results are added. main: whether this is the main page, which shows
+    everything. Other pages have fewer figures, and no sections on products that are links to other directories.
     """
     page = Page(directory, read_stage_seconds(directory))
     readers = {
@@ -295,7 +298,8 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
 
 
 def _sections_or_notice(kind: str, page: Page, read: Callable[[], list[Section]]) -> list[Section]:
-    """Return the sections on a product, or one section with a notice if numbers that are not finite prevent them."""
+    """Return the sections on a product. If numbers that are not finite prevent this, return one section with a
+    notice."""
     try:
         return read()
     except (ValueError, OverflowError) as error:  # NaN or infinity in the limits of a figure, a PDF or a count
@@ -350,7 +354,7 @@ def _ground_truth_sections(file: File) -> list[Section]:
 
 
 def _middle_plane(file: File) -> np.ndarray | None:
-    """u_x in the plane z = pi of the last reconstruction; None if the velocity is not stored."""
+    """Return u_x in the plane z = pi of the last reconstruction; None if the velocity is not stored."""
     series = FieldSeries(file, "reconstructed")
     middle = series.cells // 2
     return series.read(-1, "velocity", middle, middle + 1)[0, 0] if "velocity" in series.variables else None
@@ -416,10 +420,10 @@ def _cost_section(page: Page) -> Section:
 
 def _compare(scene: Scene | None, report: Report, page: Page, found: Mapping[str, Sequence[Row]], ranks: int,
              alone: Comm) -> tuple[list[Section], dict[str, str]]:
-    """Return the section on all variants, in a list, and the texts of variants.csv and variants.json by file name.
+    """Return the section on all variants, in a list, and the texts of variants.csv and variants.json, by file name.
 
-    Both are empty if no variant was run. page: the main page. found: `numbers` of each variant's rollouts. ranks: the
-    number of ranks of the job.
+    Both results are empty if no variant was run. page: the main page. found: `numbers` of each variant's rollouts.
+    ranks: the number of ranks of the job.
     """
     if not report.main:
         return [], {}
@@ -464,8 +468,11 @@ def _write_main(report: Report, page: Page, first: Sequence[Section], beside: Ma
 
 def _write(report: Report, page: Page, directory: Path, beside: Mapping[str, str] | None = None,
            text: str = "") -> None:
-    """Write the page of a run directory, a file with its numbers, and further files: `beside` holds their texts by file
-    name. `text` is the scene that the page shows, as TOML; if it is empty, the page shows that of the last product."""
+    """Write the page of a run directory, a file with its numbers, and further files.
+
+    `beside` holds the texts of the further files by file name. `text` is the scene that the page shows, as TOML. If it
+    is empty, the page shows the scene of the last product.
+    """
     rows = [("stage", "ranks", "wall time (s)", "date", "eddies", "commit", "libraries")]
     for kind, origin in page.provenance.items():
         stage = MAKER_OF[kind].name

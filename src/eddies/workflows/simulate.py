@@ -1,4 +1,4 @@
-"""Rollout: particles that start at a moment of the ground truth, moved by the trained model or by a baseline."""
+"""Rollout: particles start at a frame of the ground truth, and the trained model or a baseline moves them."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ log = logging.getLogger("eddies")
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Run the rollout of a scene and write rollout.h5.
 
-    A rollout whose state becomes faulty ends there, keeps its frames and reports the fault in its status. A stopped
-    rollout continues from its newest checkpoint.
+    If the state becomes faulty, the rollout ends. The product then holds the frames so far, and its status describes
+    the fault. A stopped rollout continues from its newest checkpoint.
     """
     directory, settings, device = Path(directory), scene.simulation, prepare_torch(scene.device, comm)
     provenance = stage_provenance(scene, "simulate")

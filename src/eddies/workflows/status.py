@@ -1,4 +1,4 @@
-"""`eddies status` prints the state of run directories: stages, their settings, checkpoints, jobs and sizes."""
+"""`eddies status`: print the state of run directories, that is, stages, their settings, checkpoints, jobs and sizes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def run(directory: Path, comm: Comm, verify: bool = False) -> None:
     """Print a line for each stage of a run, or of all runs in a directory; all ranks call it.
 
     With `verify` the ranks also compare all bytes of the products with their checksums, and print a line for each
-    product. Raises UserError if one is damaged or cannot be read.
+    product. Raises UserError if a product is damaged or cannot be read.
     """
     for line in in_files(comm, directory, lambda: list(status_lines(directory))):
         _print(comm, line)
@@ -49,7 +49,7 @@ def run(directory: Path, comm: Comm, verify: bool = False) -> None:
 
 
 def _complaint(comm: Comm, path: Path) -> str | None:
-    """A line, with the remedy, on a product that is damaged or cannot be read; None if it is sound; collective."""
+    """Return a line with the fault and the remedy if a product is damaged or cannot be read, else None. Collective."""
     try:
         damage = find_damage(comm, path)
     except ProductError as error:
@@ -58,14 +58,14 @@ def _complaint(comm: Comm, path: Path) -> str | None:
 
 
 def products_in(directory: Path) -> list[Path]:
-    """The products of all runs in a directory, sorted by path. A link to one of these products is left out."""
+    """Return the products of all runs in a directory, sorted by path. A link to one of these products is left out."""
     names = [stage.file for stage in STAGES.values() if stage.product]
     found = sorted((path for name in names for path in directory.rglob(name)), key=Path.is_symlink, reverse=True)
     return sorted({path.resolve(): path for path in found}.values())
 
 
 def before_checksums(path: Path) -> bool:
-    """Whether a product was written by a version without checksums."""
+    """Return whether a product was written by a version without checksums."""
     try:
         with open_to_read(path) as file:
             return ATTRIBUTE not in file.attrs
@@ -80,7 +80,7 @@ def _print(comm: Comm, line: str) -> None:
 
 
 def status_lines(directory: Path) -> Iterator[str]:
-    """The lines of all runs in a directory, sorted by path. Raises UserError if the directory holds no run."""
+    """Yield the lines of all runs in a directory, sorted by path. Raises UserError if the directory holds no run."""
     is_run = (directory / SCENE).is_file() or any((directory / stage.file).is_file() for stage in STAGES.values())
     found = [directory] if is_run else sorted(path.parent for path in directory.glob(f"**/{SCENE}"))
     if not found:
@@ -92,7 +92,8 @@ def status_lines(directory: Path) -> Iterator[str]:
 
 
 def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
-    """A line with path, size and job of a run, then one for each stage. Adds directories of variants to `inner`."""
+    """Yield a line with the path, the size and the job of a run, then a line for each stage. The directories of its
+    variants are added to `inner`."""
     files = [path for path in directory.rglob("*") if path.is_file() and not path.is_symlink()]
     size, held = in_units(sum(path.stat().st_size for path in files)), find_lock(directory)
     job = "" if held is None else f", {held.holder}{', without a sign of life' if held.stale else ''}"
@@ -132,8 +133,8 @@ def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
 def stage_state(stage: Stage, directory: Path, settings: str, continued: str, text: str) -> str:
     """Describe in words the state of a stage in a directory.
 
-    `settings` is the fingerprint of the stage, `continued` the fingerprint of checkpoints that it can continue, and
-    `text` the scene as TOML.
+    `settings` is the fingerprint of the stage, `continued` is the fingerprint of checkpoints that it can continue, and
+    `text` is the scene as TOML.
     """
     product = directory / stage.file
     origin = product_provenance(product)

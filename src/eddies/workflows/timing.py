@@ -1,5 +1,7 @@
-"""`eddies check --time`: wall time of each stage, estimated from a few steps in a temporary directory. The stages work
-with a short ground truth of the scene's flow, on the grid of the scene."""
+"""`eddies check --time`: wall time of each stage, estimated from a few steps in a temporary directory.
+
+The stages work with a short ground truth of the scene's flow, on the grid of the scene.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,7 @@ LEAST_TURNOVERS = 1e-9       # turnovers of a spin-up or ground truth with as fe
 
 
 class StepTimes(StopRequest):
-    """Records the time of each call. Stages call it before each step, to ask whether they must stop."""
+    """Records the time of each call. Stages call this object before each step, to ask whether they must stop."""
 
     def __init__(self, comm: Comm, signals: Sequence[int]) -> None:
         super().__init__(comm, signals)
@@ -60,8 +62,10 @@ class StepTimes(StopRequest):
 
 
 def run(scene: Scene, comm: Comm, signals: Sequence[int] = ()) -> None:
-    """Log seconds per step and wall time of each stage of all variants, measured on one ground truth; all ranks call
-    it. Raises Stopped after a signal."""
+    """Measure all stages of all variants, and log their seconds per step and their wall time; all ranks call it.
+
+    One short ground truth serves all stages. Raises Stopped after a signal.
+    """
     if scene.of_tracks:
         raise SceneError(f"{scene.name}: `eddies check --time` cannot shorten a scene with [tracks]; run the "
                          "scene, and read the times in its report")
@@ -71,7 +75,7 @@ def run(scene: Scene, comm: Comm, signals: Sequence[int] = ()) -> None:
     few, failed = shortened(scene, None), set()
     try:
         with temporary_directory(comm) as directory:
-            if scene.tracers:  # a single interval of frames tells how fast the flow turns over
+            if scene.tracers:  # a single frame interval gives the turnover time of the flow
                 with quiet():
                     dns.run(few.without_variants, comm, directory, stop)
                 # The measured run must not continue this one.
@@ -97,8 +101,11 @@ def run(scene: Scene, comm: Comm, signals: Sequence[int] = ()) -> None:
 
 
 def measured(name: str, measure: Callable[[], tuple[float, float, int | None]]) -> bool:
-    """Log wall time, seconds per step and number of steps of a stage, as `measure` returns them. Returns False if
-    `measure` fails. If HDF5 could not write a file, the error is raised, because the job must then be aborted."""
+    """Log the wall time, the seconds per step and the number of steps of a stage, as `measure` returns them.
+
+    Returns False if `measure` fails. If HDF5 could not write a file, the error is raised, because the job must then be
+    aborted.
+    """
     try:
         with quiet():
             seconds, step, number = measure()
@@ -133,7 +140,7 @@ def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
         definition, device = ModelDefinition.of(few), prepare_torch(whole.device, comm)
         rest, number, step = rest_of_training(definition, few.training, whole.training.frames, directory, device, stop)
         return seconds + rest, step, number
-    if stage == "find-step":  # assumes that in this run its short rollouts last one frame interval
+    if stage == "find-step":  # assumes that the short rollouts of this run last one frame interval
         span = expected.rollout.turnover_time * find_step.TURNOVERS if expected.rollout else 0.0
         return seconds * max(round(span / whole.simulation.frame_interval), 1), 0.0, 0 if expected.rollout else None
     paces = [after - before for before, after in zip(stop.times[first:], stop.times[first + 1:])]
@@ -153,8 +160,8 @@ def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
 
 def rest_of_training(definition: ModelDefinition, few: Training, frames: int, directory: Path, device: torch.device,
                      stop: StopRequest) -> tuple[float, int, float]:
-    """Estimate the work that a run of one step with the settings `few` leaves out: the preparation of further frames,
-    up to `frames` in the whole training, and the steps and validations of all phases.
+    """Estimate the work that a training of one step with the settings `few` leaves out: the preparation of further
+    frames, up to `frames` in the whole training, and the steps and validations of all phases.
 
     Returns the wall time of this work, the number of steps, and the mean seconds of a step.
     """
@@ -175,7 +182,7 @@ def rest_of_training(definition: ModelDefinition, few: Training, frames: int, di
 
 
 def shortened(scene: Scene, turnover: float | None) -> Scene:
-    """Return a scene and its variants with few frames and steps, in a flow of a given turnover time.
+    """Return a scene and its variants with few frames and steps, in a flow with this turnover time.
 
     If `turnover` is None, they have a single frame interval. The number of training steps does not change.
     """
@@ -205,7 +212,7 @@ def shortened(scene: Scene, turnover: float | None) -> Scene:
 
 @contextmanager
 def temporary_directory(comm: Comm) -> Iterator[Path]:
-    """A directory below the working directory, seen by all ranks, which is removed at the end of the block."""
+    """Make a directory below the working directory for all ranks, and remove it at the end of the block. Collective."""
     path = Path(in_files(comm, Path(), lambda: tempfile.mkdtemp(prefix="eddies-check-", dir=".")))
     try:
         yield path
@@ -226,7 +233,7 @@ def quiet() -> Iterator[None]:
 
 
 def elapsed(comm: Comm, work: Callable[[], object]) -> float:
-    """Wall seconds until all ranks have done some work."""
+    """Call `work` on all ranks, and return the wall seconds until all ranks have finished."""
     comm.Barrier()
     began = time.perf_counter()
     work()

@@ -1,5 +1,7 @@
-"""Train the particle model on tracers of the training window, or take the weights of another run; then test the model
-a priori at other times."""
+"""Train the particle model on tracers of the training window, or take the weights of another run.
+
+The model is then tested a priori over the whole ground truth.
+"""
 
 from __future__ import annotations
 
@@ -87,7 +89,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}
     save_weights(comm, product, "model", description, weights, provenance, tables)
     guard.checkpoints.remove()
-    if curves is not None:  # after the product is written: a failing picture must not lose it
+    if curves is not None:  # only now, because an error in drawing must not lose the product
         curves.draw(training)
     errors = tables["a_priori"]
     beside = (f" (the exact filtered pressure gradient alone: {errors['pressure_gradient_error'][-1]:.3f})"
@@ -103,9 +105,9 @@ def take_weights(source: StoredWeights, definition: ModelDefinition, seen: float
     """Write model.h5 with the weights that [model] path names, without training; collective.
 
     Terms work in units of the flow (Eq. 4), so only the scales and the radius of interaction change to those of this
-    flow. The tables and the cost of training are copied from the source, but the a-priori tests are repeated on this
-    flow. If the source has tests on the flow on which it was trained, they are kept as `source_a_priori`. `seen` is the
-    training window as a fraction of this ground truth.
+    flow. The tables and the cost of training are copied from `source`, but the a-priori tests are repeated on this
+    flow. If `source` has tests on the flow on which it was trained, they are kept as `source_a_priori`. `seen` is the
+    share of this ground truth that the training window covers.
     """
     comm = truth.decomposition.comm
     model = trained_model(definition, source, truth.scales, comm).to(truth.device).forced(truth.forcing)
@@ -128,7 +130,8 @@ def take_weights(source: StoredWeights, definition: ModelDefinition, seen: float
 
 
 class LearningCurves:
-    """Draws the history of a training to a file now and then, on rank 0. A failure is logged once as a warning."""
+    """Draws the history of a training to a file, on rank 0, every DRAWING_SECONDS. A failure is logged once as a
+    warning."""
 
     def __init__(self, comm: Comm, path: Path) -> None:
         self.comm, self.path, self._drawn, self._failed = comm, path, time.monotonic(), False

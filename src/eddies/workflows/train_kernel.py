@@ -36,7 +36,7 @@ from eddies.workflows.run_directory.fingerprints import stage_provenance
 
 log = logging.getLogger("eddies")
 
-# Losses of a step that are stored.
+# The losses that are stored for each step.
 LOSSES = "loss", "velocity", "gradient", "normalization"
 # Methods of reconstruction ("forms"), besides averages, whose errors are measured with the learned kernel.
 OTHER_FORMS = *DEGREES, "kriging"
@@ -45,8 +45,8 @@ OTHER_FORMS = *DEGREES, "kriging"
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Train the kernel of a scene on fields of the training window and write kernel.h5.
 
-    A second kernel is trained without the gradient loss (Fig. 1). Errors are measured on the last field. A stopped
-    training continues from its newest checkpoint.
+    A second kernel is trained without the gradient loss (Fig. 1). Errors are measured on the last field of the ground
+    truth. A stopped training continues from its newest checkpoint.
     """
     prepare_torch("cpu", comm)
     settings, directory, provenance = scene.kernel, Path(directory), stage_provenance(scene, "train-kernel")
@@ -85,7 +85,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
 
 
 def keep_form(comm: Comm, path: Path, form: str | None, provenance: Mapping[str, Any]) -> None:
-    """Write the name of a form of reconstruction into a trained kernel file that names another form; all ranks call it.
+    """Write the name `form` of a method of reconstruction into the file of a trained kernel, if the file names another
+    one; all ranks call it.
 
     Weights, tables and the id of the file do not change.
     """
@@ -98,7 +99,7 @@ def keep_form(comm: Comm, path: Path, form: str | None, provenance: Mapping[str,
 
 
 def load_sample(truth: GroundTruth, index: int, support: float) -> KernelSample:
-    """A filtered field with its exact gradient, and the particles at its time."""
+    """Load the filtered field with this index, its exact gradient, and the particles at its time."""
     slab = truth.decomposition
     velocity = truth.planes(truth.fields, index, "velocity", slab)
     grid = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
@@ -112,9 +113,9 @@ def load_sample(truth: GroundTruth, index: int, support: float) -> KernelSample:
 
 def training_of(settings: Kernel, support: float, mean_volume: float | None, seed: int,
                 samples: list[KernelSample]) -> Training:
-    """The training of two kernels: one with the gradient loss, then one without it.
+    """Return the training of two kernels: one with the gradient loss, then one without it.
 
-    `mean_volume` is the mean volume of a particle, for a kernel that may be negative; None for a positive kernel.
+    `mean_volume` is the mean volume of a particle if the kernels may be negative, and None if they are positive.
     """
     dtype, rates = samples[0].particles.dtype, (settings.learning_rate, settings.final_learning_rate)
     networks, phases = nn.ModuleDict(), []
@@ -127,7 +128,8 @@ def training_of(settings: Kernel, support: float, mean_volume: float | None, see
 
 
 def losses_of(training: Training) -> dict[str, np.ndarray]:
-    """A table with the column `step` and, for each LOSS of each PHASE, the column `LOSS_PHASE`."""
+    """Return a table with the column `step` and, for each loss and each phase, the column `LOSS_PHASE`, such as
+    `gradient_learned`."""
     columns = training.columns()
     table = {"step": np.arange(training.phases[0].steps)}
     for number, phase in enumerate(training.phases):
@@ -137,7 +139,8 @@ def losses_of(training: Training) -> dict[str, np.ndarray]:
 
 
 def shapes(kernels: dict[str, SmoothingKernel], support: float) -> dict[str, np.ndarray]:
-    """Columns `r_over_h` and, for each kernel of support h, `value_NAME` = W h^3 and `derivative_NAME` = dW/dr h^4."""
+    """Return the column `r_over_h` and, for each kernel NAME of support h, `value_NAME` = W h^3 and `derivative_NAME` =
+    dW/dr h^4."""
     r = torch.linspace(0, support, 201)
     table = {"r_over_h": (r / support).numpy()}
     for name, kernel in kernels.items():
@@ -147,7 +150,8 @@ def shapes(kernels: dict[str, SmoothingKernel], support: float) -> dict[str, np.
 
 
 def compare(kernels: dict[str, SmoothingKernel], sample: KernelSample) -> dict[str, dict[str, np.ndarray]]:
-    """Two tables: `errors` has errors and integral of each kernel, `slices` u_x and du_x/dx at z = pi. Collective."""
+    """Return two tables; collective. `errors` has the errors and the integral of each kernel. `slices` has u_x and
+    du_x/dx in the plane z = pi."""
     errors, slices = {}, {}
     slab = sample.decomposition
     slices["truth_velocity"] = _middle_plane(slab, sample.field[:, 0])
@@ -162,7 +166,7 @@ def compare(kernels: dict[str, SmoothingKernel], sample: KernelSample) -> dict[s
 
 
 def errors_of_forms(kernel: SmoothingKernel, sample: KernelSample, scales: ReferenceScales) -> dict[str, float]:
-    """Errors of OTHER_FORMS on a field; empty for a kernel that may be negative. Collective."""
+    """Return the errors of the methods OTHER_FORMS on a field; empty for a kernel that may be negative. Collective."""
     errors = {}
     for name in OTHER_FORMS if kernel.mean_volume is None else ():
         form = Form(name, kernel, scales.filter_width, scales.spacing**3)
@@ -172,7 +176,8 @@ def errors_of_forms(kernel: SmoothingKernel, sample: KernelSample, scales: Refer
 
 
 def _middle_plane(slab: SlabDecomposition, values: torch.Tensor) -> np.ndarray:
-    """The plane z = pi, [y, x], of a scalar (m,) on the grid points of this rank; equal on all ranks."""
+    """Return the plane z = pi, [y, x], of a scalar. `values` (m,) are those at the grid points of this rank; the result
+    is the same on all ranks."""
     n, middle = slab.planes, slab.planes // 2
     plane = np.zeros((n, n))
     if slab.start <= middle < slab.stop:

@@ -1,4 +1,4 @@
-"""The rows of the table of variants, and the machine that the times were measured on."""
+"""The rows of the table of variants, and a description of the machine on which the times were measured."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 COST = ("seconds_per_step", "time_step", "wall_seconds", "wall_seconds_low", "wall_seconds_high", "core_seconds",
         "ranks")
 # The search for the step: integrator and step ("etdrk4" and a Courant number on a grid), wall seconds of the search,
-# and errors of short rollouts with this step, with half of it and with twice of it.
+# and the errors of short rollouts with this step, with half of it and with twice this step.
 SEARCH = ("step_integrator", "step_size", "step_seconds", "step_error", "step_error_half", "step_error_twice")
 BEFORE = ("weights", "training_seconds", "training_steps", *SEARCH)  # cost before the rollout
 THROUGH_KERNEL = ("qr_kl", "qr_kl_floor")  # measured on gradients that the smoothing kernel reconstructs
-# Turnovers after which training, search and rollout together have taken less time than a rival, or "never". The first
-# rival is the direct simulation. The second is the cheapest grid whose velocity error is not larger.
+# Number of turnovers after which training, search and rollout together have taken less time than a rival, or "never".
+# The first rival is the direct simulation. The second is the fastest grid with at most the same velocity error.
 BREAK_EVEN = ("break_even_simulation", "break_even_grid")
 COLUMNS = ("name", "label", "method", "kind", "on_grid", "status", "stopped_at", "realisations", *MEASURES, "end",
            *COST, *BEFORE, *BREAK_EVEN, *(f"{measure}_spread" for measure in MEASURES), "settings")
@@ -44,15 +44,15 @@ MODEL, ROLLOUT = STAGES["train"].file, STAGES["simulate"].file
 
 def rows_of(scene: Scene, runs: Mapping[str, Sequence[Path]], measured: Mapping[str, Sequence[Mapping[str, Any]]],
             alone: Comm) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return a row for each variant, or one row for a scene without variants, and the names of variants with another
-    kernel. A row has the keys COLUMNS; a missing number is None.
+    """Return the rows of the table, and the names of variants with another kernel.
 
-    A kernel is compared with that of the scene or, if the scene has sets of tracers, with that of the first variant. If
-    it differs, the numbers THROUGH_KERNEL cannot be compared with those of other variants, and are left out.
+    There is a row for each variant, or one row for a scene without variants. A row has the keys COLUMNS; a missing
+    number is None. The kernel of a variant is compared with that of the scene or, if the scene has sets of tracers,
+    with that of the first variant. If it differs, the numbers THROUGH_KERNEL cannot be compared with those of other
+    variants, and are left out.
 
-    runs: directories of each variant's rollouts. measured: `numbers` of all rollouts of a variant. A variant is absent
-    there if one of its rollouts is missing. Times are in turnovers T; `wall_seconds` and `core_seconds` are per
-    turnover.
+    runs: directories of each variant's rollouts. measured: `numbers` of all rollouts of each variant, without variants
+    for which a rollout is missing. Times are in turnovers T; `wall_seconds` and `core_seconds` are per turnover.
     """
     kernel_of = partial(stage_fingerprint, stage="train-kernel")
     kernels = {name: kernel_of(variant) for name, variant in scene.variant.items()}
@@ -79,7 +79,7 @@ def rows_of(scene: Scene, runs: Mapping[str, Sequence[Path]], measured: Mapping[
 
 
 def missing_reason(directory: Path) -> str:
-    """Return why there is no rollout."""
+    """Return why the run directory of a variant has no rollout."""
     for path in (directory / FAILURE, directory.parent / FAILURE):
         if path.is_file():
             return f"failed: {path.read_text(encoding='utf-8').strip()}"
@@ -89,9 +89,9 @@ def missing_reason(directory: Path) -> str:
 def combined(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Combine the numbers of several realisations.
 
-    Each measure becomes a mean and a standard deviation, if all realisations have it. Each time becomes a median; of
-    the quartiles, the lowest and the highest are kept. The status comes from the first realisation that did not reach
-    its end, if there is one.
+    Each measure becomes a mean and a standard deviation, if all realisations have it. Each time becomes a median. Of
+    the lower quartiles the lowest is kept, and of the upper quartiles the highest. The status comes from the first
+    realisation that did not reach its end, if there is one.
     """
     found: dict[str, Any] = {"realisations": len(realised), "status": "complete"}
     found |= next(({key: one[key] for key in ("status", "stopped_at")} for one in realised
@@ -113,7 +113,8 @@ def simulation_seconds(rows: Sequence[Mapping[str, Any]], repeating: Collection[
     """Return the wall seconds per turnover of the direct simulation.
 
     `repeating` are the names of variants on the grid of the direct simulation, which are timed like the other variants.
-    The result is the time of the fastest of them. If there is none, it is `of_truth`, the time of the ground truth.
+    The result is the time of the fastest of them. If there is none, the result is `of_truth`, the time of the ground
+    truth.
     """
     repeated = [row["wall_seconds"] for row in rows if row["wall_seconds"] is not None and row["name"] in repeating]
     return min(repeated, default=of_truth)
@@ -122,9 +123,9 @@ def simulation_seconds(rows: Sequence[Mapping[str, Any]], repeating: Collection[
 def add_break_even(rows: Sequence[dict[str, Any]], simulation: float | None) -> None:
     """Add the numbers of turnovers BREAK_EVEN to the rows of trained methods.
 
-    Each method is compared with the direct simulation, and with the fastest grid whose mean velocity error is not
-    larger. The error is that at T/2 or, if no rollout reaches T/2, that at the end. The time of a method includes its
-    training, and the times of methods and grids include the search for the step.
+    Each trained method is compared with the direct simulation, and with the fastest grid whose mean velocity error is
+    not larger. The error is that at T/2 or, if no rollout reaches T/2, that at the end. The time of a method includes
+    its training. The times of methods and grids include the search for the step.
 
     simulation: wall seconds per turnover of the direct simulation; None if unknown.
     """
@@ -167,8 +168,9 @@ def notes(seeds: Sequence[int], without_kernel: Sequence[str], tracers: Mapping[
           cells: Mapping[str, int]) -> list[str]:
     """Return the sentences that a reader needs to interpret the numbers.
 
-    seeds: seeds of the realisations. without_kernel: names of the variants without the numbers THROUGH_KERNEL. tracers,
-    cells: by name of the variant, its tracers, and the cells along each side of its coarse grid, 0 without one.
+    seeds: seeds of the realisations. without_kernel: names of the variants without the numbers THROUGH_KERNEL. tracers:
+    the tracers of each variant. cells: the number of cells along each side of each variant's coarse grid, 0 without
+    one.
     """
     found = [f"Mean and standard deviation over {len(seeds)} realisations, seeds {', '.join(map(str, seeds))}, that no "
              "training has seen." if len(seeds) > 1 else
@@ -202,7 +204,7 @@ def numbers(stored: MeasuredRollout) -> dict[str, Any]:
 
 
 def step_costs(rollout: Mapping[str, Any], turnover: float, ranks: int) -> dict[str, float]:
-    """Return seconds per step, and wall seconds (with quartiles) and core seconds per turnover."""
+    """Return the seconds per step, and per turnover the wall seconds (with quartiles) and the core seconds."""
     seconds, low, high = (rollout[f"seconds_per_step{end}"] for end in ("", "_low", "_high"))
     steps = turnover / rollout["time_step"]
     return {"seconds_per_step": seconds, "wall_seconds": seconds * steps, "wall_seconds_low": low * steps,
@@ -219,7 +221,7 @@ def machine(device: str, ranks: int) -> dict[str, Any]:
 
 
 def processor() -> str:
-    """Return the name of the processor from Linux, or else its architecture."""
+    """Return the name of the processor as Linux gives it, or else its architecture."""
     information = Path("/proc/cpuinfo")
     lines = information.read_text().splitlines() if information.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -30,15 +30,15 @@ MAKING = tuple(stage.name for stage in STAGES.values() if stage.product is not N
 
 @dataclass(frozen=True)
 class Step:
-    """Stages of a scene in one directory.
+    """Stages of a scene that run in one directory.
 
     Parameters
     ----------
     scene : the scene, without variants.
     stages : the stages, in order. All make a product.
     directory : where they run.
-    variant : name of the variant; None for what all variants share.
-    links : by stage, the directory of each product that is made elsewhere and linked here.
+    variant : name of the variant; None for products that all variants share.
+    links : the directories of the products that are made elsewhere and linked here, by stage.
     files : the files of the products that the stages make.
     """
 
@@ -51,9 +51,11 @@ class Step:
 
 
 def rollouts(scene: Scene, directory: Path) -> dict[str, dict[Path, Scene]]:
-    """The rollouts by name of the variant. Each variant has one rollout for each realisation, given as the directory
-    and the scene of the rollout. The directory is a complete run directory. A scene without variants counts as one
-    variant, unless it has sets of tracers."""
+    """Return the rollouts of each variant by the variant's name, as a dict from directories to scenes.
+
+    A variant has one rollout for each realisation. The directory of a rollout is a complete run directory. A scene
+    without variants counts as one variant, unless it has sets of tracers.
+    """
     found = {}
     for name in scene.variant or (None,):
         own, where = scene.variant[name] if name else scene.without_variants, directory / (name or "")
@@ -74,10 +76,10 @@ def rollouts(scene: Scene, directory: Path) -> dict[str, dict[Path, Scene]]:
 
 
 def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[str] = ()) -> list[Step]:
-    """The steps, in order, that run some stages of a scene for the variants in `names`, by default for all variants.
+    """Return the steps, in order, that run these `stages` of a scene. `names` are the variants, by default all.
 
-    Rollouts of the variants alternate, so that a slow phase of the machine slows all of them. Products that use
-    trained weights of a file are never shared, because an earlier step may replace the file.
+    Rollouts of the variants alternate, so that a slow phase of the machine slows all of them. Products that use trained
+    weights of a file are never shared, because an earlier step may replace the file.
     """
     if not scene.variant and not scene.realisations:
         making = tuple(stage for stage in stages if stage in MAKING)
@@ -138,6 +140,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
 
 
 def _files(stages: Sequence[str], directory: Path, sets: Collection[str]) -> tuple[Path, ...]:
-    """The product files that the stages make in a directory and, for "dns", in those of the sets of tracers `sets`."""
+    """Return the product files that the stages make in a directory. The stage "dns" also makes a file in the directory
+    of each of the sets of tracers `sets`."""
     of_sets = [directory / name / STAGES["dns"].file for name in sets if "dns" in stages]
     return *(directory / STAGES[stage].file for stage in stages), *of_sets

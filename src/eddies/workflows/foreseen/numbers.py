@@ -14,7 +14,8 @@ PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) divided by u' in turbulence;
 
 @dataclass(frozen=True)
 class Turbulence:
-    """Expected turbulence of a scene, from u', eps and nu; the integral scale follows from eps = C_eps u'^3 / L."""
+    """Expected turbulence of a scene, from u', eps and nu. u' is the rms of one velocity component. The integral scale
+    L follows from eps = C_eps u'^3 / L."""
 
     velocity_rms: float
     dissipation_rate: float
@@ -44,7 +45,7 @@ class Turbulence:
 @dataclass(frozen=True)
 class Rollout:
     """Expected numbers of a rollout: turnover time of the flow, number of frame intervals, time step, number of steps,
-    and number of evaluations of the rates of the particles (0 on a coarse grid)."""
+    and number of evaluations of the particles' rates (0 on a coarse grid)."""
 
     turnover_time: float
     intervals: int
@@ -121,7 +122,7 @@ def estimate(scene: Scene) -> Estimates:
     if settings is not None:
         if turbulence is not None:
             allowed = allowed_step(settings.scheme.angle, shells, turbulence.velocity_rms)
-        # A step that is still to be found is taken as one frame interval, or less where a limit applies.
+        # A step that must still be found is assumed to be one frame interval, or less if a limit applies.
         rollout_step = settings.frame_interval if math.isinf(settings.longest_step) else settings.longest_step
         if scene.coarse_cells and peak:
             rollout_step = min(rollout_step, time.courant * BOX_LENGTH / scene.coarse_cells / peak)
@@ -137,9 +138,9 @@ def estimate(scene: Scene) -> Estimates:
 
 
 def expected_turbulence(flow: Flow, initial: Initial, forcing: Forcing | None) -> Turbulence | None:
-    """Turbulence that the forcing sustains, or that decays from a random start; None for other flows.
+    """Return the turbulence that the forcing sustains, or that decays from a random start; None for other flows.
 
-    The integral scale is sqrt(2 pi) / k, with the wavenumber k of the forcing or of the initial peak of the spectrum.
+    The integral scale is sqrt(2 pi) / k, where k is the wavenumber of the forcing or the initial peak of the spectrum.
     This is exact for the initial spectrum and holds within about 10 % for forced turbulence.
     """
     if flow.viscosity == 0:
@@ -155,7 +156,8 @@ def expected_turbulence(flow: Flow, initial: Initial, forcing: Forcing | None) -
 
 
 def peak_speed(flow: Flow, initial: Initial, turbulence: Turbulence | None) -> float | None:
-    """Expected maximum of |u| + |v| + |w|; None if the flow is from a file or of the user and has no forcing."""
+    """Return the expected maximum of |u| + |v| + |w|; None if the flow is from a file or of the user and has no
+    forcing."""
     if turbulence or initial.flow.turbulent:
         return PEAK_SPEED * (turbulence.velocity_rms if turbulence else initial.amplitude)
     if initial.flow.sound:
@@ -164,21 +166,22 @@ def peak_speed(flow: Flow, initial: Initial, turbulence: Turbulence | None) -> f
 
 
 def rms_speed(initial: Initial, turbulence: Turbulence | None) -> float | None:
-    """Expected rms of the velocity vector; None where it is unknown, and for a pure sound wave."""
+    """Return the expected rms of the velocity vector; None where it is unknown, and for a pure sound wave."""
     if turbulence:
         return math.sqrt(3) * turbulence.velocity_rms
     return initial.flow.rms and initial.flow.rms * initial.amplitude
 
 
 def courant_step(flow: Flow, time: Time, speed: float | None) -> float | None:
-    """Longest step that the Courant number allows. For an explicit stepper the speed of sound counts too."""
+    """Return the longest step that the Courant number allows. `speed` is the maximum of |u| + |v| + |w|. For an
+    explicit stepper the speed of sound counts, too."""
     sound = flow.sound_speed if time.explicit else None
     return None if speed is None else time.courant * BOX_LENGTH / flow.cells / (speed + math.sqrt(3) * (sound or 0.0))
 
 
 def flow_step(time: Time, bound: float | None) -> tuple[float | None, str]:
-    """Time step of the direct simulation, and the key of [time] that limits it. `bound` is the longest step that the
-    Courant number allows."""
+    """Return the time step of the direct simulation, and the key of [time] that limits it. `bound` is the longest step
+    that the Courant number allows."""
     if time.step is not None:
         return time.step, "step"
     if bound is None:
@@ -187,7 +190,7 @@ def flow_step(time: Time, bound: float | None) -> tuple[float | None, str]:
 
 
 def rollout_in(settings: Simulation, turnover_time: float, longest: float) -> Rollout:
-    """Rollout in a flow of a given turnover time, with steps no longer than `longest`."""
+    """Return the expected numbers of a rollout in a flow with this turnover time. No step is longer than `longest`."""
     interval = settings.frame_interval
     intervals, step = _rounded_up(settings.turnovers * turnover_time / interval), longest
     if settings.on_grid or not settings.scheme.dense:  # a whole number of steps between two frames
@@ -200,5 +203,5 @@ def rollout_in(settings: Simulation, turnover_time: float, longest: float) -> Ro
 
 
 def _rounded_up(ratio: float) -> int:
-    """Round up to a whole number; an excess of the order of round-off is ignored."""
+    """Round up to a whole number, but ignore an excess of the order of round-off."""
     return math.ceil(ratio - 1e-9)

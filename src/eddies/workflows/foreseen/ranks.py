@@ -1,4 +1,4 @@
-"""How many ranks a scene can use, and what limits them: ghost planes of slabs, and the reach of particles."""
+"""The number of ranks that a scene can use. Ghost planes of slabs and the reach of particles limit it."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -12,14 +12,14 @@ from eddies.scene.sections import NEIGHBORS
 from eddies.workflows.foreseen.numbers import expected_turbulence
 
 PEAK_VELOCITY = 4.0          # largest component of the velocity of a particle, divided by u'
-ALLOWED_VELOCITY = 6.0       # the same in the training through horizons; its ghost planes allow for this velocity
+ALLOWED_VELOCITY = 6.0       # the same, but for the number of ghost planes in the training through horizons
 GHOST_PLANES = {"cubic": 3, "quintic": 4}
 RESOLVED = "ghost planes of the resolved velocity"
 
 
 def most_ranks(scene: Scene) -> dict[str, int]:
-    """The largest number of ranks that each limit allows, by the name of the limit. A limit of a variant is included if
-    it is below all limits of the scene."""
+    """Return the largest number of ranks that each limit allows, by the name of the limit. A limit of a variant is
+    included if it is below all limits of the scene."""
     limits, tracers, simulation = {"a grid plane for each rank": scene.flow.cells}, scene.tracers, scene.simulation
     skin = simulation.skin * scene.interaction_radius if simulation else 0.0
     trains = "train" in scene.stages
@@ -68,9 +68,9 @@ def most_ranks(scene: Scene) -> dict[str, int]:
 
 def horizon_limits(horizons: Horizons | None, tracers: Tracers, velocity: float, neighbors: float,
                    needs_resolved_velocity: bool) -> dict[str, int]:
-    """Limits on the number of ranks from the training through horizons, where particles stay on their rank.
+    """Return the limits on the number of ranks in the training through horizons, where particles stay on their rank.
 
-    `velocity` is the rms of a velocity component; `neighbors` is 0 for a model without pairs.
+    `velocity` is the rms of a velocity component. `neighbors` is 0 for a model without pairs.
     """
     limits: dict[str, int] = {}
     if horizons is None:
@@ -87,9 +87,9 @@ def horizon_limits(horizons: Horizons | None, tracers: Tracers, velocity: float,
 
 def truth_limits(path: Path, horizons: Horizons | None, tracers: Tracers, neighbors: float,
                  needs_resolved_velocity: bool) -> dict[str, int]:
-    """Limits on the number of ranks, by reason, if the model is trained on the ground truth at `path` of another run.
+    """Return the limits on the number of ranks, by reason, if a model is trained on another run's ground truth `path`.
 
-    That ground truth may have another number of particles than `tracers`. Empty if there is no such file.
+    This ground truth may have another number of particles than `tracers`. The result is empty if there is no such file.
     """
     reference = product_attributes(path, "reference")
     if "spacing" not in reference:
@@ -112,18 +112,23 @@ def rank_problems(limits: Mapping[str, int], ranks: int) -> Iterator[str]:
 
 
 def reach_limit(tracers: Tracers, reach: float, when: str = "") -> dict[str, int]:
-    """The limit that `reach`, the range of particle interactions, sets: {name: ranks}. The name ends with `when`."""
+    """Return the limit that `reach`, the range of the interaction of particles, sets to the number of ranks, as a dict
+    {name: ranks}. The name ends with `when`."""
     return {f"slabs, at least as thick as the particles' reach {reach:.3g}{when}": thick_slabs(tracers.planes, reach)}
 
 
 def thick_slabs(planes: int, width: float) -> int:
-    """The largest number of slabs into which the planes can be divided if no slab may be thinner than `width`."""
+    """Return the largest number of slabs into which the planes of a grid can be divided if no slab may be thinner than
+    `width`."""
     return max(planes // math.ceil(width / (BOX_LENGTH / planes) - 1e-9), 1)
 
 
 def resolved_grid_ranks(tracers: Tracers, outside: float) -> int:
-    """The largest number of ranks for the cubic splines on the grid of the resolved velocity. The splines need one more
-    ghost plane for each plane in the distance `outside` by which a particle may leave its slab."""
+    """Return the largest number of ranks for cubic splines on the grid of the resolved velocity.
+
+    A particle may leave its slab by the distance `outside`. The splines need one more ghost plane for each plane within
+    this distance.
+    """
     planes = tracers.planes
     ghosts = GHOST_PLANES["cubic"] - 1 + max(math.ceil(outside * planes / BOX_LENGTH - 1e-9), 1)
     return max(planes // ghosts, 1)

@@ -1,11 +1,11 @@
-"""Wall time of a stage for batch requests, by a formula that holds within a factor of three.
+"""An estimate of the wall time of a stage, for batch requests. The formula holds within a factor of three.
 
     seconds = START + (transforms x TRANSFORM + pairs x (PAIR + weights x WEIGHT)) / ranks
             + calls x (CALL + ROUNDS x (ranks - 1) x MESSAGE)
 
-Here `transforms` is the number of transforms times the number of grid points. The other numbers are those of pairs of
-particles (`pairs`), network weights (`weights`), and evaluations and iterations (`calls`). `eddies check --time`
-measures the time.
+Here `transforms` is the number of transforms times the number of grid points. `pairs` is the number of pairs of
+particles, `weights` that of network weights, and `calls` that of evaluations and iterations. `eddies check --time`
+measures the time instead.
 """
 
 import math
@@ -23,21 +23,21 @@ from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_FRA
 # Seconds, measured on one and two cores of an AMD EPYC with AVX-512 (`tiny`, `hit-small`, `hit-coarse`). TRANSFORM: a
 # transform, per grid point. PAIR: a pair of particles. WEIGHT: a weight of a network, per pair. CALL: overhead of an
 # evaluation or iteration. MESSAGE: a message. START: overhead of a stage.
-# Ratios. CACHED: a transform of the direct simulation takes 1 + cells / CACHED times as long, as its planes outgrow the
-# caches. TRACER: number of pairs that take as long as a step of a tracer. SINGLE: time in single / in double precision.
-# ROUNDS: messages in a call, for each further rank.
+# Ratios. CACHED: a transform of the direct simulation takes 1 + cells / CACHED times as long, because its planes
+# outgrow the caches. TRACER: number of pairs that take as long as a step of a tracer. SINGLE: time in single precision
+# divided by that in double precision. ROUNDS: messages in a call, for each rank beyond the first.
 TRANSFORM, CACHED, SINGLE, PAIR, TRACER, WEIGHT = 4e-9, 550, 0.65, 2.5e-8, 200, 6e-11
 CALL, MESSAGE, ROUNDS = 2.5e-4, 2e-6, 4
 START = {"dns": 0.4, "train-kernel": 0.7, "reconstruct": 1.0, "train": 1.0, "find-step": 0.5, "simulate": 0.3,
          "report": 2.3}
-FORM_PAIRS = {"average": 1, "linear": 1.5, "quadratic": 2.5, "kriging": 6}  # time for a neighbour, relative to average
+FORM_PAIRS = {"average": 1, "linear": 1.5, "quadratic": 2.5, "kriging": 6}  # time of a neighbour, in units of "average"
 SEARCH, CONFIRM = 2, 0.75    # turnovers that a search simulates on the first ground truth, and on each further one
 COLD, ITERATION = 25, 12     # iterations of a solve without a first guess; transforms in each iteration
 GRADIENT = 4                 # cost of an evaluation with its gradient, relative to one without
 
 
 def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
-    """Wall time of a stage in seconds; None if the number of its steps is unknown."""
+    """Estimate the wall time of a stage in seconds; None if the number of its steps is unknown."""
     tracers, kernel, model, expected = scene.tracers, scene.kernel, scene.model, estimate(scene)
     rollout = expected.rollout
     transforms = pairs = calls = solves = weights = 0.0

@@ -1,5 +1,7 @@
-"""Estimates of the memory of a rank, and of the disk space, that the stages of a scene need, in bytes. The constants
-were measured with `tiny` to `hit` on one and two ranks, and with thin slabs of 1024^3 cells."""
+"""Estimates of the memory of a rank, and of the disk space, that the stages of a scene need, in bytes.
+
+The constants were measured with the scenes `tiny` to `hit` on one and two ranks, and with thin slabs of 1024^3 cells.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +33,9 @@ PRODUCT_BYTES, REPORT_BYTES, SAMPLE_BYTES = 45_000, 10e6, 200
 class Storage(NamedTuple):
     """Bytes that a stage needs: memory of the rank that needs the most, and disk space of the stage.
 
-    `kept` is what the stage leaves in the run directory, None if unknown. `scratch` is what it removes at its end.
-    `other_files` is the part of `kept` that is not in its product.
+    `kept` is the disk space of the files that the stage leaves in the run directory, None if unknown. `scratch` is that
+    of the files that it removes at its end. `other_files` is the part of `kept` that is not in the product of the
+    stage.
     """
 
     memory: float
@@ -42,7 +45,7 @@ class Storage(NamedTuple):
 
 
 def storage(scene: Scene, stage: str, ranks: int) -> Storage:
-    """Memory and disk space that a stage needs."""
+    """Estimate the memory and the disk space that a stage needs."""
     tracers, kernel, model, expected = scene.tracers, scene.kernel, scene.model, estimate(scene)
     if stage == "dns":
         memory = flow_memory(scene.flow, tracers, ranks)
@@ -76,7 +79,7 @@ def storage(scene: Scene, stage: str, ranks: int) -> Storage:
 
 
 def flow_memory(flow: Flow, tracers: Tracers | None, ranks: int) -> float:
-    """Memory of a rank in the direct simulation."""
+    """Return the memory of a rank in the direct simulation."""
     cells, real = flow.cells, flow.real_bytes
     block = BLOCK_ARRAYS[flow.compressible] * max(threads() * BLOCK_BYTES, 2 * cells**2 * real)
     points = cells**2 * math.ceil(cells / ranks)
@@ -86,15 +89,18 @@ def flow_memory(flow: Flow, tracers: Tracers | None, ranks: int) -> float:
 
 
 def kernel_memory(kernel: Kernel, tracers: Tracers, ranks: int) -> float:
-    """Memory of a rank in the training of the kernel."""
+    """Return the memory of a rank in the training of the kernel."""
     points = tracers.cells**3 / ranks
     lists = KERNEL_FIELDS * NEIGHBOR_BYTES * points + GRADIENT_BYTES * min(kernel.points, points)
     return TORCH_PROCESS + KERNEL_FIELDS * TABLE_BYTES * tracers.particles / ranks + lists * kernel.neighbors
 
 
 def evaluation_memory(tracers: Tracers, ranks: int, neighbors: float, skin: float, planes: int) -> float:
-    """Memory of a rank in an evaluation of the model. `neighbors` is 0 for a model without pairs. `planes` is the
-    number of planes of the grid of the resolved velocity, 0 for a model without this grid."""
+    """Return the memory of a rank in an evaluation of the model.
+
+    `neighbors` is 0 for a model without pairs. `planes` is the number of planes of the grid of the resolved velocity, 0
+    for a model without this grid.
+    """
     own = tracers.particles / ranks
     size = PARTICLE_BYTES * own + POINT_BYTES * planes**2 * math.ceil(planes / ranks)
     if neighbors:
@@ -105,7 +111,7 @@ def evaluation_memory(tracers: Tracers, ranks: int, neighbors: float, skin: floa
 
 def flow_disk(flow: Flow, tracers: Tracers | None, simulation: Simulation | None, training: Training | None,
               expected: Estimates) -> tuple[float | None, float, float]:
-    """The numbers `kept`, `scratch` and `other_files` of the direct simulation."""
+    """Return `kept`, `scratch` and `other_files` of the direct simulation (see `Storage`)."""
     k_max, intervals = flow.largest_wavenumber, expected.frame_intervals
     statistics = (SAMPLE_BYTES + 8 * (math.ceil(math.sqrt(3) * k_max) + 1)) * ((expected.steps or 0) // EVERY)
     state = flow.components * (2 * k_max + 1) ** 2 * (k_max + 1) * 2 * flow.real_bytes
@@ -123,7 +129,7 @@ def flow_disk(flow: Flow, tracers: Tracers | None, simulation: Simulation | None
 
 
 def most_disk(work: Iterable[Storage]) -> float:
-    """The most disk space that stages need at any moment, if they run one after the other."""
+    """Return the most disk space that stages need at any moment, if they run one after the other."""
     left = most = 0.0
     for needed in work:
         left += needed.kept or 0.0
@@ -132,8 +138,8 @@ def most_disk(work: Iterable[Storage]) -> float:
 
 
 def trajectory_bytes(flow: Flow, tracers: Tracers, frames: int, whole: int) -> int:
-    """Size of frames of tracers (position, velocity, images of the box and density), of filtered fields, and of the
-    unfiltered states, whose number is `whole`."""
+    """Return the size of the frames of tracers (position, velocity, images of the box and density), of the filtered
+    fields, and of the unfiltered states. `whole` is the number of unfiltered states."""
     size = 0
     for each in tracers.all:
         points = (each.cells**3 * math.ceil(frames / each.field_every)
@@ -143,11 +149,11 @@ def trajectory_bytes(flow: Flow, tracers: Tracers, frames: int, whole: int) -> i
 
 
 def rollout_bytes(particles: int, frames: int) -> int:
-    """Size of frames of a model (position, velocity, acceleration and images of the box)."""
+    """Return the size of the frames of a rollout (position, velocity, acceleration and images of the box)."""
     return frames * 42 * particles
 
 
 def in_units(size: float) -> str:
-    """Bytes as text, such as "1.2 GB"."""
+    """Return a number of bytes as text, such as "1.2 GB"."""
     unit, name = next(((unit, name) for unit, name in ((1e9, "GB"), (1e6, "MB")) if size >= unit), (1e3, "kB"))
     return f"{size / unit:.3g} {name}" if name == "GB" else f"{size / unit:.0f} {name}"

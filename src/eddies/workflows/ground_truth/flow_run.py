@@ -29,11 +29,11 @@ from eddies.workflows.ground_truth.frame_counts import whole_cells
 
 @dataclass
 class FlowRun:
-    """A fluid and its state, the time stepper, the clock and the history.
+    """A fluid and its state, the time stepper, the clock and the history of statistics.
 
-    `guard` is called before each step; `watch` is called after it and ends an unstable run. `phase` is "spin-up",
-    "start" (before the next phase begins), "run" (from the time `began` on) or "tracers" (then `tracers` is set).
-    `max_step` limits the steps with tracers, in addition to `step_limit`.
+    `guard` is called before each step, and writes checkpoints. `watch` is called after each step, and ends an unstable
+    run. `phase` is "spin-up", "start" (before the next phase begins), "run" (from the time `began` on) or "tracers"
+    (then `tracers` is set). `max_step` limits the steps with tracers, in addition to `step_limit`.
     """
 
     fluid: Fluid
@@ -58,15 +58,14 @@ class FlowRun:
         return self.clock.steps
 
     def advance(self, observers: Sequence[Callable], step_limit: Callable | None = None) -> None:
-        """Take steps until the clock ends, and call each observer after each step. A given `step_limit` replaces that
-        of the run.
+        """Take steps until the clock ends, and call each observer after each step.
 
-        Raises FlowDiverged at an unstable step.
+        If `step_limit` is given, it replaces the step limit of the run. Raises FlowDiverged at an unstable step.
         """
         while self.clock.running:
             self.guard(self, self.tracers.segments if self.tracers else None)
             step = (step_limit or self.step_limit)(self.state, self.clock)
-            with np.errstate(over="ignore", invalid="ignore"):  # the watch reports both
+            with np.errstate(over="ignore", invalid="ignore"):  # the watch reports both faults
                 state = self.stepper(self.state, step)
                 self.clock.tick(step)
                 self.watch(self.state, state, step, self.clock)
@@ -75,14 +74,15 @@ class FlowRun:
                 observer(self.state, self.clock)
 
     def state_dict(self) -> dict[str, Any]:
-        """The state for a checkpoint, with the state of the tracers."""
+        """Return the state for a checkpoint, with the state of the tracers."""
         modes = saved_modes(self.fluid.grid, self.state)
         return {"phase": self.phase, "began": self.began, "modes": modes, "clock": self.clock.state_dict(),
                 "step_limit": self.step_limit.state_dict(), "watch": self.watch.state_dict(),
                 **self.history.state_dict(), **(self.tracers.state_dict() if self.tracers else {})}
 
     def load_state_dict(self, saved: Checkpoint) -> None:
-        """Continue from a checkpoint, made on any number of ranks. Tracers read their part themselves."""
+        """Continue from a checkpoint, made on any number of ranks. TracerRun and TracerSet read the state of the
+        tracers."""
         self.phase, self.began = saved["phase"], saved["began"]
         self.state = restored_modes(self.fluid.grid, saved, 4)
         self.clock.load_state_dict(saved["clock"])
@@ -92,14 +92,14 @@ class FlowRun:
 
 
 class TracerSet:
-    """The particles of one set, and its filtered fields and spectra.
+    """The tracers of one set, and the filtered fields and energy spectra that are stored with them.
 
     Parameters
     ----------
     fluid, state : the flow.
     settings, seed : settings of the set, and the seed of random places.
     saved : the checkpoint, or None to release new particles.
-    suffix : end of the names of the set's series in segments and of its arrays in checkpoints; empty for the only set.
+    suffix : added to the names of the set's series in segments and of its arrays in checkpoints (`suffix_of`).
     """
 
     def __init__(self, fluid: Fluid, state: np.ndarray, settings: Tracers, seed: int, saved: Checkpoint | None,
@@ -120,7 +120,8 @@ class TracerSet:
         self.spectra = {name: [] if saved is None else list(saved[f"spectra_{name}{suffix}"]) for name in names}
 
     def store(self, segments: FrameSegments, state: np.ndarray, step: int, time: float, with_fields: bool) -> None:
-        """Store the particles and, if `with_fields`, filtered fields and spectra; `time` counts from the release."""
+        """Store the particles and, if `with_fields`, the filtered fields and the spectra. `step` is the number of the
+        step, and `time` is the time since the release."""
         columns, compressible = self.tracers.columns, self.fluid.compressible
         order = IdOrder(self.comm, columns["id"], self.settings.particles)
         frame = {name: order.apply(columns[name]) for name in ("position", "velocity")}
@@ -139,14 +140,14 @@ class TracerSet:
             self.spectra[name].append(value)
 
     def scales(self, segments: FrameSegments) -> dict[str, float]:
-        """Scales of the particles at the release. Rates are differences between the first two frames, so that the
+        """Return the scales of the particles at the release. Rates are differences between the first two frames, so the
         scales do not depend on the rest of the run."""
         (start, first), (end, second) = segments.first_frames(f"tracers{self.suffix}", 2)
         return {"filter_width": self.settings.filter_width, "spacing": self.settings.spacing,
                 "density_mean": MEAN_DENSITY, **measured_scales(self.comm, first, second, end - start)}
 
     def state_dict(self) -> dict[str, Any]:
-        """The state for a checkpoint, without the frames."""
+        """Return the state for a checkpoint, without the frames."""
         order = IdOrder(self.comm, self.tracers.columns["id"], self.settings.particles)
         columns = {name: Block(order.apply(self.tracers.columns[name]), order.start, self.settings.particles)
                    for name in ("position", "velocity")}
@@ -163,17 +164,17 @@ class TracerSet:
 class TracerRun:
     """Releases tracers into a flow, or takes them from a checkpoint, and follows them to the end.
 
-    Within a frame interval all steps are equal: the longest allowed steps that divide it, so that frames are equally
-    spaced. `released` is the sample of the flow at the release. `sets` holds the sets by name; the name of a single set
-    is "".
+    All steps within a frame interval are equal. They are the longest allowed steps that divide the interval, so frames
+    are equally spaced in time. `released` holds the statistics of the flow at the release. `sets` holds the sets by
+    name; the name of a single set is "".
 
     Parameters
     ----------
-    flow : its forcing ends at the release unless [tracers] forced is true.
+    flow : the run of the flow. Its forcing ends at the release unless [tracers] forced is true.
     segments : the files for the frames.
     settings, seed : [tracers], and the seed of random places.
-    whole : function that takes the number of frames, and returns those frames that also store the unfiltered flow. All
-        of the returned frames have filtered fields.
+    whole : function that takes the number of frames, and returns the numbers of those frames that also store the
+        unfiltered flow. All of these frames have filtered fields.
     saved : the checkpoint, or None.
     """
 
@@ -197,7 +198,8 @@ class TracerRun:
 
     @property
     def intervals(self) -> int:
-        """Number of frame intervals; at least one, over which the rates at the release are measured."""
+        """Number of frame intervals. There is at least one, because the rates at the release are measured over the
+        first one."""
         duration = self.settings.turnovers * self.released["eddy_turnover_time"]
         return max(int(np.ceil(duration / self.settings.frame_interval - 1e-9)), 1)
 
@@ -205,7 +207,7 @@ class TracerRun:
         """Follow the tracers to the end of the last interval."""
         flow = self.flow
         progress = ProgressLine("tracers", flow.history.describe, done=self._done)
-        if self.stored <= self.interval:  # stopped within an interval
+        if self.stored <= self.interval:  # the checkpoint was made within an interval
             self._finish_interval(progress)
         while self.interval < self.intervals:
             self.interval += 1
@@ -214,12 +216,12 @@ class TracerRun:
             self._finish_interval(progress)
 
     def scales(self, name: str) -> dict[str, float]:
-        """Scales of the flow and of the particles of a set at the release."""
+        """Return the scales of the flow and of the particles of a set at the release."""
         return {"released_at": self.released_at, "sound_speed": self.flow.fluid.sound_speed,
                 **self.sets[name].scales(self.segments)}
 
     def state_dict(self) -> dict[str, Any]:
-        """The state of the tracers for a checkpoint, without the flow and without the files of `segments`."""
+        """Return the state of the tracers for a checkpoint, without the flow and without the files of frames."""
         found = {"released": self.released, "released_at": self.released_at, "interval": self.interval,
                  "step": self.step, "first_step": self.first_step, "frames": self.stored}
         for each in self.sets.values():
@@ -246,7 +248,8 @@ class TracerRun:
         flow.history.leave_out(time.perf_counter() - began)
 
     def _store(self) -> None:
-        """Store a frame, with filtered fields and spectra every `field_every` frames. Times count from the release."""
+        """Store a frame. Every `field_every` frames it has filtered fields and spectra. Times count from the
+        release."""
         state, fluid, time_since = self.flow.state, self.flow.fluid, self.flow.clock.time - self.released_at
         steps, with_fields = self.flow.clock.steps, self.stored % self.settings.field_every == 0
         self.segments.open(steps)
@@ -262,18 +265,20 @@ class TracerRun:
 
 
 def grid_of(fine: SpectralGrid, cells: int) -> SpectralGrid:
-    """A grid with `cells` cells along an axis and all modes of a finer grid that it can hold."""
+    """Return a grid with `cells` cells along each axis. It keeps those modes of the grid `fine` that it can hold."""
     slab = SlabDecomposition(fine.decomposition.comm, fine.decomposition.length, cells)
     return SpectralGrid(slab, fine.precision, min(fine.cutoff, (cells - 1) // 2))
 
 
 def suffix_of(name: str) -> str:
-    """The end of the names of a set's series and arrays; empty for a single set, whose name is ""."""
+    """Return the suffix that marks the series and arrays of a set of tracers: "-NAME", or "" for a single set, whose
+    name is ""."""
     return name and f"-{name}"
 
 
 def frame_layout(settings: Tracers, compressible: bool, cutoff: int) -> FrameLayout:
-    """The datasets of the frames of all sets; `cutoff` is the largest wavenumber of the unfiltered flow."""
+    """Return the layout of the frames of all sets of tracers. `cutoff` is the largest wavenumber of the unfiltered
+    flow."""
     columns, variables = {"position": (3,), "velocity": (3,)}, {"velocity": 3}
     if compressible:
         columns, variables = columns | {"density": ()}, variables | {"density": 1}
@@ -285,16 +290,17 @@ def frame_layout(settings: Tracers, compressible: bool, cutoff: int) -> FrameLay
 
 
 def series_of(name: str) -> dict[str, str]:
-    """A dict from the names of a set's series in `frame_layout` to their names in the ground truth of the set."""
+    """Map the names of a set's series in `frame_layout` to their names in the ground truth of this set."""
     return {f"{series}{suffix_of(name)}": series for series in ("tracers", "filtered")} | {"unfiltered": "unfiltered"}
 
 
 def saved_modes(grid: SpectralGrid, modes: np.ndarray) -> Block:
-    """Modes (..., kz, ky, kx) of a grid for a checkpoint. The axis ky is divided among the ranks."""
+    """Return the modes (..., kz, ky, kx) of a grid for a checkpoint. The axis ky is divided among the ranks."""
     return Block(modes, int(grid.column_starts[grid.decomposition.rank]), grid.modes, axis=modes.ndim - 2)
 
 
 def restored_modes(grid: SpectralGrid, saved: Checkpoint, dimensions: int, name: str = "modes") -> np.ndarray:
-    """This rank's part of the modes in a checkpoint, an array with the given number of dimensions."""
+    """Return this rank's part of the modes that a checkpoint holds under `name`. The modes are an array with this
+    number of `dimensions`."""
     start, stop = grid.column_starts[grid.decomposition.rank:][:2]
     return saved.read(name, int(start), int(stop), axis=dimensions - 2)

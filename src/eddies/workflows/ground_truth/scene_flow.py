@@ -25,11 +25,11 @@ from eddies.spectral.spectral_grid import SpectralGrid, regrid
 
 log = logging.getLogger("eddies")
 
-MOST_REMOVED = 0.05  # largest share of energy in the divergent part of another code's flow; more gives a warning
+MOST_REMOVED = 0.05  # share of energy in the part with divergence above which another code's flow gives a warning
 
 
 def build_fluid(flow: Flow, forcing: Forcing | None, comm: Comm) -> Fluid:
-    """The fluid of [flow] on its grid, with the forcing of [forcing]."""
+    """Build the fluid of [flow] on its grid, with the forcing of [forcing]."""
     grid = SpectralGrid(SlabDecomposition(comm, BOX_LENGTH, flow.cells), flow.precision)
     forced = LinearForcing(grid, forcing.injection_rate, forcing.wavenumber) if forcing is not None else None
     kind = load(flow.fluid) if is_path(flow.fluid) else FLUIDS[flow.fluid]
@@ -39,7 +39,8 @@ def build_fluid(flow: Flow, forcing: Forcing | None, comm: Comm) -> Fluid:
 
 
 def build_step_limit(time: Time, flow: Flow, grid: SpectralGrid) -> CourantLimit | FixedStep:
-    """The limit of the time step: fixed, or a Courant number, which includes sound for the explicit stepper only."""
+    """Return the limit of the time step: a fixed step, or the Courant number. The speed of sound counts only for an
+    explicit stepper."""
     if time.step is not None:
         return FixedStep(time.step)
     explicit_sound = flow.sound_speed if time.explicit and flow.compressible else 0.0
@@ -47,7 +48,7 @@ def build_step_limit(time: Time, flow: Flow, grid: SpectralGrid) -> CourantLimit
 
 
 def initial_state(initial: Initial, seed: int, fluid: Fluid) -> np.ndarray:
-    """The modes of the initial state: velocity, and for a compressible fluid s = ln(rho / rho_0)."""
+    """Return the modes of the initial state: the velocity and, for a compressible fluid, s = ln(rho / rho_0)."""
     grid = fluid.grid
     if initial.flow.from_file:
         return _state_from_file(initial, fluid)
@@ -67,7 +68,8 @@ def initial_state(initial: Initial, seed: int, fluid: Fluid) -> np.ndarray:
 
 
 def _velocity_of_user(initial: Initial, seed: int, grid: SpectralGrid) -> np.ndarray:
-    """The solenoidal part of the velocity that a function of the user returns. Raises SceneError for a wrong shape."""
+    """Return the solenoidal part of the velocity that a function of the user returns. Raises SceneError for a wrong
+    shape."""
     shape = (3, *grid.spectral_shape)
     function = load(initial.kind)
     with users_code(function, SceneError, f'; [initial] kind = "{initial.kind}" is called with (grid, initial, seed)'):
@@ -80,7 +82,8 @@ def _velocity_of_user(initial: Initial, seed: int, grid: SpectralGrid) -> np.nda
 
 
 def given_spectrum(initial: Initial, comm: Comm) -> tuple[np.ndarray, np.ndarray]:
-    """Wavenumbers and E(k) in the file of [initial] path; all ranks call it. Raises SceneError if it is unfit."""
+    """Read the wavenumbers and E(k) from the file of [initial] path; all ranks call it. Raises SceneError if it cannot
+    be used."""
     try:
         return on_first_rank(comm, lambda: read_spectrum(initial.file))
     except ProductError as error:
@@ -89,9 +92,9 @@ def given_spectrum(initial: Initial, comm: Comm) -> tuple[np.ndarray, np.ndarray
 
 @contextmanager
 def stored_states(initial: Initial, comm: Comm) -> Iterator[StoredStates | VelocityCubes]:
-    """Open the unfiltered flow states in the file that a scene starts from; all ranks call it.
+    """Open the file of unfiltered flow states from which a scene starts; all ranks call it.
 
-    Raises SceneError if [initial] state is too large, ProductError if the file has no state.
+    Raises SceneError if the file has no state with the number [initial] state, ProductError if it has no state at all.
     """
     with open_states(comm, initial.file) as states:
         if initial.state >= len(states):

@@ -25,16 +25,19 @@ MARGIN = 4.0      # distance between a volume and its periodic image, in mean pa
 
 @dataclass(frozen=True)
 class MeasuredTracks:
-    """Rows, each a particle in a frame, in the units of a scene (box edge 2 pi). They are sorted by frame, then by id.
+    """Measured tracks in the units of a scene (box edge 2 pi). A row is a particle in a frame. Rows are sorted by
+    frame, then by id.
 
     Parameters
     ----------
     times : times of the frames, from 0 on, (frames,).
     starts : first row of each frame, and at the end the number of rows, (frames + 1,).
-    columns : id (rows,), position and velocity (rows, 3), and, with [tracks] sound_speed, density / its mean (rows,).
+    columns : `id` (rows,), `position` and `velocity` (rows, 3). With [tracks] sound_speed also `density` (rows,), in
+        units of its mean.
     throughout : whether the track of a row is present in all frames, (rows,).
     spacing : mean particle spacing, the cube root of (volume with particles / mean number of rows of a frame).
-    unit : the scene's unit of length, in the file's unit. corner : the file's origin in the cube, in the file's unit.
+    unit : the scene's unit of length, in the unit of the file.
+    corner : position in the periodic cube of the origin of the file's coordinates, in the unit of the file.
     about : the attributes of the product that describe the file and the tracks.
     """
 
@@ -58,7 +61,8 @@ class MeasuredTracks:
         return int(self.throughout[:self.starts[1]].sum())
 
     def frame(self, number: int, complete: bool = False) -> dict[str, np.ndarray]:
-        """The rows of a frame; if `complete`, only tracks that are present in all frames, with new ids 0, 1, ..."""
+        """Return the rows of a frame. If `complete`, only rows of tracks that are present in all frames are returned,
+        with new ids 0, 1, ..."""
         rows = np.arange(*self.starts[number:number + 2])
         if not complete:
             return {name: values[rows] for name, values in self.columns.items()}
@@ -66,14 +70,15 @@ class MeasuredTracks:
         return {name: values[rows] for name, values in self.columns.items()} | {"id": np.arange(len(rows))}
 
     def shared(self, number: int, other: int) -> dict[str, np.ndarray]:
-        """The rows of frame `number` whose tracks are also in frame `other`."""
+        """Return the rows of frame `number` whose tracks are also in frame `other`."""
         rows, others = (np.arange(*self.starts[frame:frame + 2]) for frame in (number, other))
         rows = rows[np.isin(self.columns["id"][rows], self.columns["id"][others])]
         return {name: values[rows] for name, values in self.columns.items()}
 
 
 class TrackFrames:
-    """The frames of a file with tracks; rank 0 holds them. All ranks make this object and call its methods together."""
+    """The frames of a file with tracks. Rank 0 holds them; the methods divide their rows among the ranks. The
+    constructor and all methods are collective."""
 
     def __init__(self, comm: Comm, settings: Settings) -> None:
         self.comm = comm
@@ -88,11 +93,11 @@ class TrackFrames:
         return round((BOX_LENGTH / self.spacing) ** 3)
 
     def frame(self, number: int, complete: bool = False) -> dict[str, np.ndarray]:
-        """This rank's block of the rows of a frame (`MeasuredTracks.frame`)."""
+        """Return this rank's block of the rows of a frame; see `MeasuredTracks.frame`."""
         return self._block(lambda tracks: tracks.frame(number, complete))
 
     def shared(self, number: int, other: int) -> dict[str, np.ndarray]:
-        """This rank's block of the rows that two frames share (`MeasuredTracks.shared`)."""
+        """Return this rank's block of the rows that `MeasuredTracks.shared` returns."""
         return self._block(lambda tracks: tracks.shared(number, other))
 
     def _block(self, rows: Callable[[MeasuredTracks], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -106,9 +111,10 @@ class TrackFrames:
 
 
 def read_measured(settings: Settings) -> MeasuredTracks:
-    """The tracks of a file; one rank calls it. If splines are needed, tracks with fewer than three rows are left out.
+    """Read the tracks of the file of [tracks]; one rank calls it.
 
-    Raises ProductError if the file is unfit, SceneError if it has too few frames.
+    If splines are needed, tracks with fewer than three rows are left out. Raises ProductError if the file cannot be
+    used, SceneError if it does not fit [tracks], for example with too few frames.
     """
     state = settings.file.stat() if settings.file.is_file() else None
     return _read_measured(settings, state and (state.st_size, state.st_mtime_ns))
@@ -148,7 +154,8 @@ def _read_measured(settings: Settings, state: tuple[int, int] | None) -> Measure
 
 
 def _at_frames(found: Tracks, settings: Settings) -> Tracks:
-    """The tracks at times 0, h, 2 h, ... in the time unit of the velocities; h is rounded to six digits.
+    """Return the tracks with the times 0, h, 2 h, ..., in the time unit of the velocities. The frame interval h is
+    rounded to six digits.
 
     Raises SceneError for too few frames, unequal intervals or a frame without tracks.
     """
@@ -172,11 +179,11 @@ def _at_frames(found: Tracks, settings: Settings) -> Tracks:
 
 
 def _placed(found: Tracks, settings: Settings) -> tuple[Tracks, float, float, np.ndarray]:
-    """Place the tracks in a periodic cube. Return the tracks with their new positions, the edge of the cube, the
-    measured volume, and the position in the cube of the origin of the file's coordinates.
+    """Place the tracks in a periodic cube.
 
-    If the measured volume is not periodic, it lies in the middle of a larger cube, at least `margin` away from its
-    periodic images.
+    Returns the tracks with their new positions, the edge of the cube, the measured volume, and the position in the cube
+    of the origin of the file's coordinates. If the measured volume is not periodic, it lies in the middle of a larger
+    cube, at least [tracks] margin away from its periodic images.
     """
     if settings.volume is None:
         edge = settings.box if settings.box is not None else found.edge

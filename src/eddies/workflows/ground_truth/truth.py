@@ -1,4 +1,4 @@
-"""Read the ground truth: frames of particles on slabs, fields and scales."""
+"""Read the ground truth: frames of particles, each on the rank of its slab, and fields and scales."""
 
 from __future__ import annotations
 
@@ -64,11 +64,13 @@ class GroundTruth:
             kolmogorov_length=r["kolmogorov_length"], **density)
 
     def particles(self, frame: int) -> dict[str, np.ndarray]:
-        """id, position, velocity and, if stored, density of this rank's particles at a frame."""
+        """Return the columns `id`, `position`, `velocity` and, if stored, `density` of this rank's particles at a
+        frame."""
         return migrate(self.decomposition, self.block(frame))
 
     def particles_with_rates(self, frame: int) -> dict[str, np.ndarray]:
-        """Columns of `particles`, and the rates `acceleration` (n, 3) and, if a density is stored, `density_rate` (n,).
+        """Return the columns of `particles` with the rates `acceleration` (n, 3) and, if a density is stored,
+        `density_rate` (n,).
 
         The rates are centred differences along trajectories. Raises ValueError for the first and the last frame.
         """
@@ -82,7 +84,7 @@ class GroundTruth:
         return migrate(self.decomposition, columns)
 
     def window(self, frame: int, length: int) -> dict[str, np.ndarray]:
-        """Columns of `particles` at a frame, and values of the same particles in the next frames:
+        """Return the columns of `particles` at a frame, and values of the same particles in the next `length` frames:
         `position_later` and `velocity_later` (n, length, 3), `density_later` (n, length)."""
         columns = self.block(frame)
         later = [self.block(frame + number) for number in range(1, length + 1)]
@@ -91,7 +93,10 @@ class GroundTruth:
         return migrate(self.decomposition, columns)
 
     def planes(self, series: FieldSeries, index: int, variable: str, slab: SlabDecomposition) -> np.ndarray:
-        """The planes (components, z_local, y, x) of a slab, in double precision; `series` is `fields` or `states`."""
+        """Return a variable on the planes of a slab, (components, z_local, y, x), in double precision.
+
+        `series` is `fields` or `states`, and `index` is the number of the field in this series.
+        """
         return self._together(lambda: series.read(index, variable, slab.start, slab.stop)).astype(np.float64)
 
     @cached_property
@@ -105,7 +110,8 @@ class GroundTruth:
         return [] if "tracks" in self._file else self._frames_of(self.states)
 
     def field_at(self, frame: int, points: torch.Tensor) -> np.ndarray:
-        """The stored filtered velocity (m, 3) at the time of a frame, at the grid points (m, 3) of this rank."""
+        """Return the stored filtered velocity (m, 3) at the time of a frame. `points` (m, 3) are the grid points of the
+        field on this rank."""
         cells, index = self.fields.cells, self.field_frames.index(frame)
         planes = len(points) // cells**2
         first = round(float(points[0, 2]) * cells / self.decomposition.length) if planes else 0
@@ -113,7 +119,8 @@ class GroundTruth:
         return field.reshape(3, -1).T.astype(np.float64)
 
     def block(self, frame: int, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """The id and the columns `names` (by default all) at a frame, for the particles in this rank's block of ids."""
+        """Return the ids and the columns `names` (by default all) of the particles in this rank's block of ids, at a
+        frame."""
         start, stop = id_block(self.decomposition.comm, self.total)
         names = ("position", *self._evolving) if names is None else names
         columns = self._together(lambda: {name: self.trajectory.read(frame, name, start, stop) for name in names})

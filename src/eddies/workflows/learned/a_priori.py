@@ -1,4 +1,4 @@
-"""A-priori tests of a trained model: its rates compared with the truth at times outside the training (Fig. 3)."""
+"""A-priori tests of a trained model: comparison of its rates with the true rates in the whole ground truth (Fig. 3)."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from eddies.workflows.learned.training_data import load_frame
 @torch.no_grad()
 def evaluate(truth: GroundTruth, model: LagrangianModel, last_seen: int,
              dtype: torch.dtype) -> dict[str, dict[str, np.ndarray]]:
-    """Test a model at frames with a filtered field, evenly spread over the ground truth, and return tables by name;
-    collective.
+    """Test a model at frames with a filtered field, and return tables by name; collective.
 
-    `acceleration_sample` and, if learned, `density_rate_sample` hold true and predicted rates at the last frame.
-    `a_priori` has a row for each frame, with the `delay` since frame `last_seen` and these normalised L2 errors:
+    The frames are evenly spread over the ground truth. `acceleration_sample` and, if learned, `density_rate_sample`
+    hold true and predicted rates at the last of these frames. `a_priori` has a row for each frame, with the `delay`
+    since frame `last_seen`, negative before it, and these normalised L2 errors:
 
-    `acceleration_error`: acceleration by the model as in a rollout, with the density that its terms give.
-    `true_density_acceleration_error`: acceleration by the model with the true density.
-    `density_rate_error`: learned rate of the density, or rate of change of the density that terms give.
-    `pressure_gradient_error`: -c^2 grad ln(rho) of the filtered field as acceleration, without a model. If the flow is
-    forced after the release of the tracers, the forcing is added.
+    `acceleration_error`: of the model's acceleration as in a rollout, with the density that its terms give.
+    `true_density_acceleration_error`: of the model's acceleration with the true density.
+    `density_rate_error`: of the learned rate of the density, or of the rate of change of the density that terms give.
+    `pressure_gradient_error`: of the acceleration -c^2 grad ln(rho) of the filtered field, without a model. If the flow
+    is forced after the release of the tracers, the forcing is added.
     """
     rows, comm = [], truth.decomposition.comm
     usable = np.array(between_frames(len(truth.times), truth.field_frames))
@@ -65,7 +65,8 @@ def evaluate(truth: GroundTruth, model: LagrangianModel, last_seen: int,
 
 
 def _given_rate_error(truth: GroundTruth, dynamics: ParticleDynamics, index: int) -> float:
-    """Error of the rate of change of the density that terms give, by centred differences along true trajectories."""
+    """Return the normalised L2 error of the rate of change of the density that terms give. The rate is a centred
+    difference along true trajectories."""
     comm, total = truth.decomposition.comm, truth.total
 
     def density(frame: int) -> np.ndarray:
@@ -79,7 +80,7 @@ def _given_rate_error(truth: GroundTruth, dynamics: ParticleDynamics, index: int
 
 
 def _pressure_error(truth: GroundTruth, index: int, frame: TrainingFrame) -> float:
-    """The normalised L2 error `pressure_gradient_error` of `evaluate` at a frame; collective."""
+    """Return the error `pressure_gradient_error` of `evaluate` at a frame; collective."""
     acceleration, device = frame.acceleration, frame.acceleration.device
     forcing = frame.kept[FORCING].at(None).acceleration if FORCING in frame.kept else torch.zeros_like(acceleration)
     slab = SlabDecomposition(truth.decomposition.comm, truth.decomposition.length, truth.fields.cells)
@@ -97,7 +98,8 @@ def _pressure_error(truth: GroundTruth, index: int, frame: TrainingFrame) -> flo
 
 def _sample(truth: GroundTruth, frame: TrainingFrame, exact: torch.Tensor,
             error: torch.Tensor) -> dict[str, np.ndarray]:
-    """True and predicted rates of the particles with the lowest ids, equal on all ranks."""
+    """Return the true and the predicted rates of the particles with the lowest ids, the same arrays on all ranks.
+    `error` is the predicted rate minus the true rate."""
     comm = truth.decomposition.comm
     order = IdOrder(comm, as_numpy(frame.particles.id), truth.total)
     own = max(TESTED_PARTICLES - order.start, 0)

@@ -30,9 +30,9 @@ log = logging.getLogger("eddies")
 
 
 def initial_model(definition: ModelDefinition, scales: ReferenceScales, comm: Comm) -> LagrangianModel:
-    """The model with initial parameters, equal on all ranks, for a flow of these scales; collective.
+    """Make the model with initial parameters, equal on all ranks, for a flow of these scales; collective.
 
-    Raises SceneError if a class of the user is not a term, cannot be made, or differs between ranks.
+    Raises SceneError if a class of the user is not a term, cannot be instantiated, or differs between ranks.
     """
     try:
         model = build_model(definition.model.settings, definition.model.terms, definition.units(scales))
@@ -43,10 +43,11 @@ def initial_model(definition: ModelDefinition, scales: ReferenceScales, comm: Co
 
 
 def take_from_first_rank(model: nn.Module, comm: Comm) -> None:
-    """Copy parameters and buffers of rank 0 to all ranks, with a warning if they differed; collective.
+    """Copy parameters and buffers of rank 0 to all ranks; collective. If they differ between ranks, log a warning.
 
-    Raises SceneError on all ranks if names, their order, shapes, types or `requires_grad` differ between ranks, or if a
-    parameter has no shape yet. The order matters: gradients of ranks are summed in the order of the tensors.
+    Raises SceneError on all ranks if the tensors have other names, shapes, types, `requires_grad` or another order on
+    some rank, or if a parameter has no shape yet. The order matters: gradients of ranks are summed in the order of the
+    tensors.
     """
     tensors = [*model.named_parameters(), *model.named_buffers()]
     own = [[name, _form(tensor)] for name, tensor in tensors]
@@ -83,13 +84,14 @@ def _form(tensor: torch.Tensor) -> str:
 
 
 def _bytes(tensor: torch.Tensor) -> np.ndarray:
-    """The memory of a tensor as bytes, without a copy; works for types that numpy or MPI lack."""
+    """Return the memory of a tensor as bytes, without a copy. This also works for number types that numpy or MPI
+    lack."""
     return tensor.reshape(-1).view(torch.uint8).numpy()
 
 
 def trained_model(definition: ModelDefinition, stored: StoredWeights, scales: ReferenceScales,
                   comm: Comm) -> LagrangianModel:
-    """The model with stored weights, in their precision, for a flow of these scales; collective.
+    """Make the model with the stored weights, in their precision, for a flow of these scales; collective.
 
     Raises ProductError if the weights are those of another model.
     """
@@ -109,16 +111,17 @@ def trained_model(definition: ModelDefinition, stored: StoredWeights, scales: Re
 
 
 def particles_for(model: LagrangianModel, columns: dict[str, np.ndarray], device: torch.device) -> ParticleSet:
-    """The true particles as a start for a model. They have a density only if the model integrates it."""
+    """Make the particles on which a model starts from `columns` of true particles. They have a density only if the
+    model integrates it."""
     particles = ParticleSet.from_numpy(columns, device)
     return particles if model.integrates_density else replace(particles, density=None)
 
 
 def load_form(comm: Comm, path: str | Path, scales: ReferenceScales, device: torch.device | str = "cpu") -> Form:
-    """The form of field reconstruction that a kernel file names, with its kernel, for a flow of these scales.
+    """Load the method of reconstruction (`Form`) that a kernel file names, with its kernel, for a flow of these scales.
 
-    The kernel is a table in single precision. Raises ProductError if the file cannot be read, or was trained with
-    another formula of the kernel.
+    The kernel is a table in single precision. Raises ProductError if the file cannot be read, or if its kernel was
+    trained with another formula.
     """
     stored = load_weights(comm, path, "kernel")
     description = stored.description

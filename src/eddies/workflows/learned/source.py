@@ -45,16 +45,18 @@ class ModelDefinition:
 
     @classmethod
     def of(cls, scene: Scene) -> ModelDefinition:
-        """The definition in a scene."""
+        """Return the definition in a scene."""
         return cls(scene.model, scene.tracers, scene.neighbors, scene.seed)
 
     def units(self, scales: ReferenceScales) -> FlowUnits:
-        """Units of a flow with these scales. The radius of interaction is proportional to the mean particle spacing."""
+        """Return the units for a flow with these scales. The radius of interaction is proportional to the mean particle
+        spacing."""
         radius = self.tracers.radius_of(self.neighbors) * (scales.spacing / self.tracers.spacing)
         return FlowUnits(scales, radius, self.neighbors, self.seed)
 
     def describe(self, scales: ReferenceScales) -> dict[str, Any]:
-        """The description that is stored with the weights, ready for JSON: terms with settings, and scales."""
+        """Return the description that is stored with the weights: the terms with their settings, the scales, and the
+        number of neighbours if a term reads pairs. It can be written as JSON."""
         settings = {term: asdict(self.model.settings[short_name(term)]) for term in self.model.terms}
         neighbors = {"neighbors": self.neighbors} if "pairs" in self.model.reads else {}
         return {"terms": settings, "scales": scales.to_dict(), **neighbors}
@@ -62,7 +64,7 @@ class ModelDefinition:
     def differences(self, description: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
         """Yield key, own value and stored value, as TOML, for each difference from a stored description.
 
-        Classes are compared by name, so that no class is imported because a file names it.
+        Classes are compared by name, so that reading a file never imports a class that it names.
         """
         trained_terms = description["terms"]
         if list(self.model.terms) != list(trained_terms):
@@ -71,7 +73,7 @@ class ModelDefinition:
         for term, trained in trained_terms.items():
             name, settings = short_name(term), self.model.settings[short_name(term)]
             wanted = json.loads(json.dumps(asdict(settings)))
-            # If an older description lacks a key, the default of the key is meant.
+            # If an older description lacks a key, it means the default of this key.
             stored = {field.name: field.default for field in fields(settings) if field.default is not MISSING}
             stored = json.loads(json.dumps(stored)) | trained
             for key in wanted.keys() | stored.keys():
@@ -107,9 +109,9 @@ def trained_on(source: StoredWeights, path: str) -> tuple[dict[str, Any], dict[s
     """Return the origin of the weights, and the a-priori errors on the flow on which they were trained.
 
     The origin holds `path` and `mach_turbulent` of the run that trained the weights. If `source` itself took its
-    weights from another run, the result is the origin that it stores; the errors are None if it stores none. If the
-    weights were trained only on ground truths of other runs, the origin holds the Mach numbers of these, `truths`,
-    instead of `mach_turbulent`, and the errors are None.
+    weights from another run, both results are those that `source` stores; the errors are None if it stores none. If the
+    weights were trained only on ground truths of other runs, the origin holds `path` and `truths`, the Mach numbers of
+    these ground truths, and the errors are None.
     """
     origin = source.provenance
     if "source" in origin:

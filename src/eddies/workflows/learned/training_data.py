@@ -32,16 +32,17 @@ log = logging.getLogger("eddies")
 
 
 class TrainingData:
-    """A model in the units of a ground truth, and that ground truth's frames and windows for training and validation.
+    """A model in the units of a ground truth, with the frames and windows of this ground truth for training and
+    validation.
 
-    `last` is the last frame of the training window. `learned` is the last frame that is trained on; later frames
-    up to `last` are for validation.
+    `last` is the last frame of the training window. `learned` is the last frame that is trained on; later frames up to
+    `last` are for validation.
 
     Parameters
     ----------
     definition, settings : the definition of the model, and [training].
     truth : the ground truth, of this run or another.
-    count : number of frames, and of windows, for training.
+    count : number of frames for training, and also number of windows.
     like : a model with which the parameters are shared; None for new parameters.
     """
 
@@ -66,18 +67,18 @@ class TrainingData:
         return frames
 
     def force_trainer(self, kernel: SmoothingKernel | None) -> ForceTrainer:
-        """The trainer on single frames."""
+        """Return the trainer on single frames. The `kernel` is needed for the field loss."""
         settings = self.settings
         weights = LossWeights(settings.field_weight, settings.velocity_kl_weight, settings.acceleration_kl_weight,
                               settings.power_weight)
         return ForceTrainer(self.model, self.frames, kernel, weights, settings.batch, self.definition.seed)
 
     def validation_frame(self) -> TrainingFrame:
-        """The last held-out frame of the training window; collective."""
+        """Return the last held-out frame of the training window; collective."""
         return self._frame(self.held_out)
 
     def rollout_trainer(self) -> tuple[RolloutTrainer, TrainingWindow]:
-        """The trainer on windows of frames, and the window for validation; collective."""
+        """Return the trainer on windows of frames, and the window for validation; collective."""
         settings, slab = self.settings.horizons, self.truth.decomposition
         interval = self.definition.tracers.frame_interval
         drift = ALLOWED_VELOCITY * self.model.flow.scales.velocity * interval * self.longest
@@ -86,7 +87,8 @@ class TrainingData:
         if resolution is None and settings.energy_weight > 0:
             resolution = ResolvedVelocity.on_slabs(slab, self.model.flow.scales, drift, self.dtype)
         if resolution is not None:
-            # Gradients neglect how a predicted start depends on earlier states, so it must not affect the solution.
+            # Gradients neglect that the predicted start of a solve depends on earlier states. Therefore the start must
+            # not affect the solution, and the tolerance is the usual one.
             resolution.tolerance_predicted = resolution.tolerance
         starts = evenly(self.learned - self.longest + 1, self.count)
         windows = [self._window(start, resolution) for start in starts]
@@ -116,8 +118,10 @@ class TrainingData:
 
 def model_for(definition: ModelDefinition, truth: GroundTruth, dtype: torch.dtype,
               like: LagrangianModel | None = None) -> LagrangianModel:
-    """The model in the units of a ground truth, with the forcing of that flow. It has initial parameters, or shares
-    those of the model `like`."""
+    """Return the model in the units of a ground truth, with the forcing of its flow.
+
+    The model has initial parameters, or shares those of the model `like`.
+    """
     model = initial_model(definition, truth.scales, truth.decomposition.comm).to(dtype=dtype, device=truth.device)
     if like is not None:
         model.share_parameters(like)
@@ -125,7 +129,8 @@ def model_for(definition: ModelDefinition, truth: GroundTruth, dtype: torch.dtyp
 
 
 def training_data(definition: ModelDefinition, settings: Training, truths: Sequence[GroundTruth]) -> list[TrainingData]:
-    """Training data of each ground truth. All share one set of parameters, and the frames are divided evenly."""
+    """Return the training data of each ground truth. All of them share one set of parameters. The number of frames for
+    training is divided evenly among them."""
     data: list[TrainingData] = []
     for number, truth in enumerate(truths):
         count = len(range(number, settings.frames, len(truths)))
@@ -135,7 +140,7 @@ def training_data(definition: ModelDefinition, settings: Training, truths: Seque
 
 def load_frame(truth: GroundTruth, index: int, model: LagrangianModel, dtype: torch.dtype,
                with_field: bool = False) -> TrainingFrame:
-    """A frame with its true rates and, if `with_field`, the filtered field one frame later; collective.
+    """Load a frame with its true rates and, if `with_field`, the filtered field one frame later; collective.
 
     The particles have the true density if the model integrates the density.
     """
@@ -155,7 +160,8 @@ def load_frame(truth: GroundTruth, index: int, model: LagrangianModel, dtype: to
 
 
 def _field_after(truth: GroundTruth, frame: int, dtype: torch.dtype) -> FieldLater:
-    """The filtered field one frame after a frame, and the positions of the particles at that time."""
+    """Return the filtered field one frame after `frame`, with the positions and velocities of the particles at that
+    time."""
     slab, device = truth.decomposition, truth.device
     columns = truth.window(frame, 1)  # rows as in `particles_with_rates`
     position, later = (torch.from_numpy(columns[name]) for name in ("position", "position_later"))

@@ -27,7 +27,8 @@ from eddies.workflows.learned.training_data import TrainingData
 
 log = logging.getLogger("eddies")
 
-# Particles for the validation error of the acceleration, and cubes or batches for the validation error of all losses.
+# Number of particles for the validation error of the acceleration, and number of cubes or batches for that of all
+# losses.
 VALIDATION_PARTICLES, COMBINED_DRAWS = 8192, 8
 # Number of validations in a phase on single frames, and in a phase on windows.
 VALIDATIONS, HORIZON_VALIDATIONS = 25, 4
@@ -38,7 +39,8 @@ Trainer = TypeVar("Trainer")
 
 
 def training_phases(data: Sequence[TrainingData], kernel_file: Path) -> list[Phase]:
-    """All phases of a training; none if the model has no parameters. The kernel is read only for the field loss."""
+    """Return all phases of a training; none if the model has no parameters. The kernel is read only if there is a field
+    loss."""
     if next(data[0].model.parameters(), None) is None:
         return []
     kernel, truth = None, data[0].truth
@@ -48,7 +50,8 @@ def training_phases(data: Sequence[TrainingData], kernel_file: Path) -> list[Pha
 
 
 def one_step_phases(data: Sequence[TrainingData], kernel: SmoothingKernel | None) -> list[Phase]:
-    """Phases of training on the rates of single frames: first the trajectory loss alone, then all losses."""
+    """Return the phases of training on the rates of single frames: first with the trajectory loss alone, then with all
+    losses."""
     settings = data[0].settings
     if [*import_paths(data[0].definition.model)]:  # terms or networks of the user
         first = data[0].frames[0]
@@ -76,7 +79,7 @@ def one_step_phases(data: Sequence[TrainingData], kernel: SmoothingKernel | None
 
 
 def horizon_phases(data: Sequence[TrainingData]) -> list[Phase]:
-    """Phases of training on windows of frames, one for each horizon in [training.horizons]."""
+    """Return the phases of training on windows of frames, one for each horizon in [training.horizons]."""
     settings = data[0].settings.horizons
     if settings is None:
         return []
@@ -102,9 +105,10 @@ def horizon_phases(data: Sequence[TrainingData]) -> list[Phase]:
 
 
 def feature_range(data: Sequence[TrainingData]) -> FeatureRange:
-    """The range of the network inputs over all pairs in the training frames; collective.
+    """Return the range of the network inputs over all pairs in the training frames; collective.
 
-    States that the model reaches within the horizons are left out, because they are not the truth.
+    States that the model itself reaches in the training through horizons are left out, because they are not true
+    states.
     """
     blocks = (block for each in data for frame in each.frames
               for block in pair_features(frame.dynamics, frame.seen()))
@@ -121,11 +125,11 @@ def _mean(error: Callable, trainers: Sequence, held_out: Sequence) -> Callable[[
 
 def take_all_steps(training: Training, guard: Guard, stage: str, section: str, remedy: str,
                    after_each: Callable[[Training], None] = lambda training: None) -> None:
-    """Run a training to its end, from its newest checkpoint if one exists. Log lines begin with `stage`; `after_each`
-    is called after each step.
+    """Run a training to its end, from its newest checkpoint if one exists. Log lines begin with `stage`, and
+    `after_each` is called after each step.
 
-    Raises Stopped after a checkpoint if a stop is requested. Raises SceneError, which names the `section` and the
-    `remedy`, if the training diverges.
+    Raises Stopped after a checkpoint if a stop is requested. Raises SceneError if the training diverges; the text names
+    the `section` and the `remedy`.
     """
     saved = guard.checkpoints.newest()
     if saved is not None:

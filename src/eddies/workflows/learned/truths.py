@@ -1,4 +1,4 @@
-"""The ground truths that a model is trained on: the one of the run, or those that [training] truths names."""
+"""The ground truths that a model is trained on: that of the run itself, or those that [training] truths names."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ from eddies.workflows.ground_truth.truth import GroundTruth, open_truth
 @contextmanager
 def open_truths(own_file: Path, named: Sequence[Path], comm: Comm,
                 device: torch.device) -> Iterator[tuple[GroundTruth, list[GroundTruth]]]:
-    """Open the ground truth of a run, and the list of ground truths that are named for training; collective.
+    """Open the ground truth of a run, and those for training, whose files are `named`; collective.
 
-    If none is named, the list holds the run's own ground truth.
+    Yields the ground truth of the run, and the list of the ground truths for training. If `named` is empty, this list
+    holds the ground truth of the run.
     """
     with ExitStack() as files:
         own = files.enter_context(open_truth(comm, own_file, device))
@@ -33,9 +34,9 @@ def open_truths(own_file: Path, named: Sequence[Path], comm: Comm,
 
 def truth_problems(settings: Training, tracers: Tracers, reads: Collection[str], own_file: Path,
                    comm: Comm) -> list[str]:
-    """Reasons why [training] truths cannot be used with terms that read the inputs `reads`; all ranks call it.
+    """Return the reasons why [training] truths cannot be used with terms that read the inputs `reads`. Collective.
 
-    Each reason is one line. The ground truth of the run itself, `own_file`, is not examined: it may not exist yet.
+    Each reason is one line. The file of the run's own ground truth, `own_file`, is not examined: it may not exist yet.
     """
     own, problems, seen = own_file.resolve(), [], set()
     for name, path in zip(settings.truths or (), settings.truth_files):
@@ -55,7 +56,8 @@ def truth_problems(settings: Training, tracers: Tracers, reads: Collection[str],
 
 def _problems_of(file: File, settings: Training, tracers: Tracers, reads: Collection[str],
                  comm: Comm) -> Iterator[str]:
-    """Reasons why an open ground truth of another run does not fit [training], [tracers] and the inputs `reads`."""
+    """Yield the reasons why an open ground truth of another run does not fit [training], [tracers] and the inputs
+    `reads`."""
     if "particles/tracers" not in file:
         yield "holds no tracers to learn from; give the run of a scene with [tracers]"
         return

@@ -22,16 +22,16 @@ log = logging.getLogger("eddies")
 
 
 def frame_layout(total: int, length: float, density: bool) -> FrameLayout:
-    """The datasets of a rollout with `total` particles in a box of edge `length`."""
+    """Return the layout of the frames of a rollout with `total` particles in a box of edge `length`."""
     columns = {"position": (3,), "velocity": (3,), "acceleration": (3,)} | ({"density": ()} if density else {})
     return FrameLayout(length, {"model": TrajectoryLayout(total, columns)}, np.float32, {})
 
 
 class Course:
-    """Runs a method through `count` frame intervals, from the start or from a checkpoint.
+    """Runs a method through `count` frame intervals of the length `interval`, from the start or from a checkpoint.
 
-    Frames are written into `segments`. `guard` is called before each step. A method without `state_dict` makes no
-    checkpoints.
+    Frames are written into `segments`. `guard` is called before each step and writes checkpoints. There are no
+    checkpoints if the method has no `state_dict`.
     """
 
     def __init__(self, method: Method, segments: FrameSegments, count: int, interval: float, guard: Guard,
@@ -54,9 +54,9 @@ class Course:
     def run(self) -> dict[str, float | str]:
         """Advance to the last frame, or until the state is faulty.
 
-        Returns attributes of the product: `status`, `time` of the last frame, and number of `steps`. If a step was
-        taken, they include the mean `time_step`, and `storing_share`, the share of the wall time that storing took. If
-        a step was timed, they include those of `quartiles`.
+        Returns attributes of the product: `status`, the `time` of the last frame, and the number of `steps`. If a step
+        was taken, there are also the mean `time_step`, and `storing_share`, the share of the wall time that storing
+        took. If a step was timed, the attributes of `quartiles` are added.
         """
         complaint: str | None = None
         if not self.times:
@@ -80,7 +80,7 @@ class Course:
                 "steps": self.steps, **step, **quartiles(self.seconds)}
 
     def state_dict(self) -> dict[str, Any]:
-        """The state for a checkpoint, without the frames, which have files of their own."""
+        """Return the state for a checkpoint, without the frames, which have files of their own."""
         return {"rollout": {"clock": self.clock.state_dict(), "energy": self.energy, "ranks": self.comm.size,
                             "seconds": self.seconds, "times": self.times},
                 **self.method.state_dict()}
@@ -104,9 +104,10 @@ class Course:
         return complaint
 
     def _store(self, at: float) -> None:
-        """Store the frame at a time, and keep the mean kinetic energy <v.v>/2 of its particles."""
+        """Store the frame at the time `at`, and keep the mean kinetic energy <v.v>/2 of its particles."""
         layout, own = self.segments.layout, self.segments.layout.trajectories["model"]
-        # The first step uses the forces of the first frame. Later frames evaluate forces for storing only.
+        # The first step uses the forces of the first frame. Later frames evaluate forces for storing only, so their time
+        # counts as storing.
         with self.progress.storing() if self.times else nullcontext():
             particles, acceleration = self.method.frame(at)
         with self.progress.storing():
@@ -125,7 +126,8 @@ class Course:
 
 
 def quartiles(seconds: Sequence[float]) -> dict[str, float]:
-    """Median `seconds_per_step` of timed steps, and quartiles `..._low` and `..._high`; empty without timed steps."""
+    """Return the median of the wall seconds of timed steps, `seconds_per_step`, and their quartiles,
+    `seconds_per_step_low` and `seconds_per_step_high`. Without timed steps the result is empty."""
     if not seconds:
         return {}
     low, median, high = np.quantile(seconds, (0.25, 0.5, 0.75))

@@ -1,4 +1,4 @@
-"""Rollouts by Eulerian large-eddy simulation on a coarse grid. Particles follow its filtered velocity."""
+"""Rollouts by Eulerian large-eddy simulation on a coarse grid. Particles follow the filtered velocity of the flow."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from eddies.workflows.ground_truth.flow_run import restored_modes, saved_modes
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.saved_particles import restored_rows, saved_rows
 
-# A flow is unstable if its energy exceeds its initial energy by this factor.
+# A flow is unstable if its energy is more than this factor times its initial energy.
 RUNAWAY_ENERGY = 100.0
 
 
@@ -44,15 +44,18 @@ class EulerianRun:
 
     Parameters
     ----------
-    fluid : on the coarse grid. longest_step, courant : limits of the step.
-    interpolation : the splines from the grid to the particles.
+    fluid : the fluid on the coarse grid.
+    start : number of the frame.
+    longest_step, courant : largest time step, and largest Courant number.
+    interpolation : the splines that interpolate from the grid to the particles.
     """
 
     def __init__(self, settings: Eulerian, fluid: Fluid, truth: GroundTruth, start: int, longest_step: float,
                  courant: float, interpolation: str) -> None:
         self.settings, self.fluid, self.longest_step = settings, fluid, longest_step
         grid = fluid.grid
-        # Widths of two filters: one that the fluid's velocity has passed, and one still to apply for the particles.
+        # Width of the filter that the fluid's velocity has passed. Width of the filter that must still be applied to
+        # this velocity, because particles follow the filtered one.
         filter_passed = filter_of(settings, truth)
         filter_left = 0.0 if filter_passed else truth.scales.filter_width
         self.stepper, self.clock = ETDRK4(fluid), Clock()
@@ -77,10 +80,10 @@ class EulerianRun:
         return self.clock.time
 
     def advance(self, until: float, number: int) -> str | None:
-        """Divide the time left to `until` into equal steps and take the first one. Returns on all ranks the fault of
-        the new state, or None.
+        """Divide the time left to `until` into equal steps and take the first one, the step with this `number`.
 
-        The Courant number of the present flow and [simulation] step limit the step.
+        The step is limited by the Courant number of the present flow and by [simulation] step. Returns a text that
+        describes the fault of the new state, or None if there is no fault; the result is the same on all ranks.
         """
         left = until - self.time
         longest = min(self.step_limit.bound(self.state, self.clock), self.longest_step)
@@ -101,7 +104,7 @@ class EulerianRun:
         return None
 
     def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
-        """The particles, with the density of a compressible fluid, and their acceleration (n, 3).
+        """Return the particles and their acceleration (n, 3). The particles of a compressible fluid have a density.
 
         The acceleration is du/dt + v.grad u, with the filtered velocity u and the velocity v of the particle. Its only
         error is that of the splines.
@@ -119,7 +122,7 @@ class EulerianRun:
         return ParticleSet.from_numpy(self.tracers.columns | density), torch.from_numpy(values[:, :3] + along)
 
     def status(self) -> str:
-        """Return an empty text: the progress line shows nothing of this method."""
+        """Return an empty text, because the progress line shows nothing special of this method."""
         return ""
 
     def series(self) -> dict[str, dict[str, list[float]]]:
@@ -127,7 +130,7 @@ class EulerianRun:
         return {}
 
     def state_dict(self) -> dict[str, Any]:
-        """The state for a checkpoint; collective."""
+        """Return the state for a checkpoint; collective."""
         grid = self.fluid.grid
         return {"modes": saved_modes(grid, self.state), "clock": self.clock.state_dict(),
                 "flow_seconds": self.flow_seconds,
@@ -143,8 +146,11 @@ class EulerianRun:
         self.tracers = TracerParticles(self.tracers.field, columns, self.state)
 
     def description(self) -> dict[str, float | str]:
-        """Attributes for the product: grid, fluid and closure. If a step was taken, they include
-        `flow_seconds_per_step`, the median wall seconds of a step of the flow without the particles."""
+        """Return the attributes of the product that describe the grid, the fluid and the closure.
+
+        If a step was taken, there is also `flow_seconds_per_step`, the median wall seconds of a step of the flow alone,
+        without the particles.
+        """
         grid = self.fluid.grid
         seconds = {"flow_seconds_per_step": float(np.median(self.flow_seconds))} if self.flow_seconds else {}
         key = self.settings.form.constant
@@ -156,7 +162,8 @@ class EulerianRun:
 
 def coarse_fluid(settings: Eulerian, flow: Flow, precision: str, forcing: Forcing | None, truth: GroundTruth,
                  damping: np.ndarray | None) -> Fluid:
-    """The fluid on its coarse grid, with its forcing and its closure. `damping` has the rates of a learned closure."""
+    """Make the fluid on its coarse grid, with its forcing and its closure. `damping` has the rates of a learned
+    closure, see `EddyDamping`."""
     slab, width = truth.decomposition, truth.scales.filter_width
     grid = SpectralGrid(SlabDecomposition(slab.comm, slab.length, settings.cells_for(width)), precision)
     filter_passed = filter_of(settings, truth)
@@ -167,16 +174,17 @@ def coarse_fluid(settings: Eulerian, flow: Flow, precision: str, forcing: Forcin
 
 
 def filter_of(settings: Eulerian, truth: GroundTruth) -> float:
-    """Width of the filter that the velocity of the equations has passed: that of the truth, or 0 without a filter."""
+    """Return the width of the filter that the velocity in the equations has passed: that of the truth, or 0 if the
+    velocity is unfiltered."""
     return truth.scales.filter_width if settings.equations == "filtered" else 0.0
 
 
 def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float,
                damping: np.ndarray | None) -> Closure | None:
-    """The closure of the equations for a velocity that has passed a filter of this width.
+    """Return the closure of the equations. Their velocity has passed a filter of the width `filter_width`.
 
-    If `filter_width` is 0, the filter is the sharp cut-off of the grid at its highest wavenumber k_c, and Smagorinsky's
-    length Delta is pi/k_c.
+    If the width is 0, the filter is the sharp cut-off of the grid at its highest wavenumber k_c, and Smagorinsky's
+    length Delta is pi/k_c. `damping` is as in `coarse_fluid`.
     """
     width = filter_width or math.pi / grid.cutoff
     made = {
@@ -192,11 +200,11 @@ def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float,
 
 
 def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame: int) -> np.ndarray:
-    """Modes of the true flow at a frame, on the grid of `fluid`. The velocity is filtered with the width
+    """Return the modes of the true flow at a frame, on the grid of `fluid`. The velocity is filtered with the width
     `filter_passed`; 0 means no filter.
 
-    A compressible fluid also has a density. It is read from the frame if there is no filter. If there is one, the
-    density is in balance with the filtered velocity. Raises SceneError if the unfiltered flow is not stored at the
+    For a compressible fluid the state has a density, too. Without a filter, the density is that of the true flow. With
+    a filter, it is in balance with the filtered velocity. Raises SceneError if the unfiltered flow is not stored at the
     frame.
     """
     grid, series = fluid.grid, truth.states
@@ -227,11 +235,11 @@ def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame:
 
 @torch.no_grad()
 def state_of_particles(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame: int) -> np.ndarray:
-    """Modes of the flow, found by least squares from the velocities of the true particles at a frame
+    """Return the modes of the flow that least squares find from the velocities of the true particles at a frame
     (`ResolvedVelocity`). Modes that the particles do not resolve are zero.
 
-    If `filter_passed` is 0, the filter of the particles' velocity is undone. A compressible fluid gets a density in
-    balance with the velocity.
+    If `filter_passed` is 0, the filter of the particles' velocity is undone. For a compressible fluid the state has a
+    density, which is in balance with the velocity.
     """
     solver, grid = ResolvedVelocity.on_slabs(truth.decomposition, truth.scales), fluid.grid
     resolved = solver.of(ParticleSet.from_numpy(truth.particles(frame)))

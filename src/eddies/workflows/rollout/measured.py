@@ -1,4 +1,4 @@
-"""The rollout of a run directory, the true tracers beside it, and all measures of both."""
+"""Measures of a rollout in a run directory and of the true tracers in its ground truth."""
 
 from __future__ import annotations
 
@@ -36,13 +36,14 @@ class TrueParticles:
     """The true tracers at the times of a rollout, in single precision like the particles of the rollout.
 
     The acceleration is the centred difference of the velocity along trajectories. The column `image` counts how often a
-    particle has left the cube since the first of these times.
+    particle has left the cube along each axis since the first of these times.
 
     Parameters
     ----------
     tracers : the tracers of the ground truth.
-    start_time : start of the rollout. times : times of its frames since then, (m,). A time is left out if the tracers
-        have no frame at this time, or only their first or last frame.
+    start_time : time in the ground truth at which the rollout starts.
+    times : times of the frames of the rollout since its start, (m,). A time is left out if the tracers have no frame at
+        this time, or only their first or last frame.
     """
 
     def __init__(self, tracers: Trajectory, start_time: float, times: np.ndarray) -> None:
@@ -68,7 +69,7 @@ class TrueParticles:
 
 @dataclass(frozen=True)
 class ComputedSeries:
-    """A series with one column, computed frame by frame."""
+    """A series with one column. Each frame is computed by `make` when it is read."""
 
     times: np.ndarray
     column: str
@@ -80,7 +81,7 @@ class ComputedSeries:
         return (self.column,)
 
     def read(self, frame: int, column: str) -> np.ndarray:
-        """Compute a frame."""
+        """Compute a frame; `column` is the only column."""
         return self.make(frame)
 
 
@@ -89,7 +90,7 @@ NOTHING = ComputedSeries(np.zeros(0), "velocity", lambda frame: np.zeros((0, 3))
 
 
 class OnDemand(dict):
-    """Values of a function by frame, each computed once, when it is first used."""
+    """A dict from frames to the values of a function. Each value is computed once, when it is first used."""
 
     def __init__(self, measure: Callable[[int], Any]) -> None:
         super().__init__()
@@ -103,14 +104,15 @@ class OnDemand(dict):
 class MeasuredRollout:
     """An open rollout on one rank, with its measures: spectra, invariants and planes at single frames.
 
-    Each measure is computed once. All ranks can compute measures together with `measure`; the others are computed
-    by this rank when they are first used.
+    All ranks can compute measures together with `measure`. Any other measure is computed by this rank when it is first
+    used, and kept.
 
     Parameters
     ----------
-    rollout : the rollout and its truth. provenance : provenance of rollout.h5.
+    rollout : the rollout and its truth.
+    provenance : provenance of rollout.h5.
     directory : the run directory.
-    fields : the fields of "model" and "truth"; empty if the kernel or the ground truth is missing.
+    fields : the reconstructed fields of "model" and "truth"; empty if the kernel or the ground truth is missing.
     solver : makes spectra of particles; None without a ground truth.
     stationary : whether the ground truth has a stationary state.
     """
@@ -123,14 +125,17 @@ class MeasuredRollout:
 
     @property
     def particles(self) -> dict[str, Any]:
-        """The particles "model" and "truth" by name; those without frames are left out."""
+        """The particles of "model" and "truth", by these names; particles without frames are left out."""
         return {name: run for name, run in (("model", self.rollout.model), ("truth", self.rollout.truth))
                 if len(run.times)}
 
     @property
     def exported(self) -> dict[str, dict[str, Any]]:
-        """Under "fields" and "particles": a mapping from "model" and "truth" to their series. Without a kernel, there
-        are no fields, and particles have no velocity gradients."""
+        """The series to export: a dict with the keys "fields" and "particles". Each value maps "model" and "truth" to a
+        series.
+
+        Without a kernel, there are no fields, and the particles have no velocity gradients.
+        """
         if not self._fields:
             return {"fields": {}, "particles": self.particles}
         fields = {name: self._fields[name] for name in self.particles}
@@ -139,7 +144,8 @@ class MeasuredRollout:
 
     @property
     def groups(self) -> dict[str, Any]:
-        """Series that `open_run` offers beside the stored ones, named like groups of a product."""
+        """The series that `open_run` offers in addition to the stored ones. Their names are like those of groups of a
+        product."""
         found: dict[str, Any] = {f"particles/{name}": run for name, run in self.particles.items() if name != "model"}
         for name, run in self.particles.items():
             if self._solver is not None:
@@ -154,10 +160,11 @@ class MeasuredRollout:
                 known: TruthMeasures | None = None) -> None:
         """Measure a share of the frames on each rank and collect everything on rank `root`; all ranks call it.
 
-        page: if true, measure what a page shows, else only what `accuracy` needs. every_frame: if true, measure the
-        velocity gradient at all common frames and, for a page, spectra at several; else both at the last one. known:
-        measures of true tracers from earlier calls; new ones are added. Ranks other than `root` keep only measures in
-        `known`. Raises ProductError on all ranks if one of them cannot read a frame.
+        page: if true, measure what a page of the report shows; if false, only what `accuracy` needs. every_frame: if
+        true, measure the velocity gradient at all common frames and, for a page, spectra at several frames; if false,
+        measure both only at the last common frame. known: measures of true tracers from earlier calls; new ones are
+        added. Ranks other than `root` keep only the measures in `known`. Raises ProductError on all ranks if one of
+        them cannot read a frame.
         """
         if self._solver is None:
             return
@@ -184,13 +191,14 @@ class MeasuredRollout:
             log.info("report: %s", complaints[0] + (f" ({len(complaints)} such solves)" if complaints[1:] else ""))
 
     def forget(self) -> None:
-        """Free all measures. A measure that is used later is made again."""
+        """Free all measures. A measure that is used later is computed again."""
         for measures in (self.rollout.spectra, self.rollout.invariants, self.rollout.planes):
             for of_frames in (measures or {}).values():
                 of_frames.clear()
 
     def _tasks(self, page: bool, every_frame: bool) -> list[Task]:
-        """List the measures to make; empty if model and truth have no common frame."""
+        """List the measures to make, with `page` and `every_frame` as in `measure`. The list is empty if model and
+        truth have no common frame."""
         run = self.rollout
         try:
             common = run.common
@@ -210,7 +218,8 @@ class MeasuredRollout:
         return list(dict.fromkeys(tasks))
 
     def _key(self, task: Task) -> Any:
-        """Return the key of a true measure in TruthMeasures. For the model, return the task, which is no key there."""
+        """Return the key in TruthMeasures of a measure of true tracers. Measures of the model are not kept there: for
+        these, return the task itself."""
         quantity, of, frame = task
         if of == "model":
             return task
@@ -222,7 +231,7 @@ class MeasuredRollout:
 def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
     """Open the rollout of a run directory on one rank, with its ground truth and kernel if they are there.
 
-    A ground truth that the rollout was not made from is left out. Raises ProductError if a file cannot be read.
+    The ground truth is left out if the rollout was made from another one. Raises ProductError if a file cannot be read.
     """
     with ExitStack() as files:
         def opened(kind: str) -> Any:

@@ -1,4 +1,4 @@
-"""Methods that move the particles of a rollout: the interface, the methods of the package, and their choice."""
+"""The methods that move the particles of a rollout: their interface, and the choice of the method of a scene."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Method(Protocol):
     """Moves the particles of a rollout. All functions are collective.
 
     A user's class is called with (scene, truth, start, directory, device), where `start` is the frame of the ground
-    truth at which the rollout starts. It may lack `state_dict` and `load_state_dict`. A rollout that was stopped then
-    starts again from the beginning.
+    truth at which the rollout starts. It may lack `state_dict` and `load_state_dict`. A stopped rollout then starts
+    again from the beginning.
     """
 
     has_density: bool  # whether the particles of a frame have a density
@@ -38,23 +38,27 @@ class Method(Protocol):
     time: float  # time of the particles since the start of the rollout
 
     def advance(self, until: float, number: int) -> str | None:
-        """Take one step, the `number`-th, towards the time `until`. The step may pass that time if `frame` can
-        interpolate. Returns on all ranks a text on the fault of the new state, None for a sound state."""
+        """Take the step with this `number` towards the time `until`.
+
+        The step may pass that time if `frame` can interpolate. Returns a text that describes the fault of the new
+        state, or None if there is no fault; the result is the same on all ranks.
+        """
 
     def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
-        """The particles at a time within the last step, in any order, and their acceleration (n, 3)."""
+        """Return the particles at a time within the last step, in any order, and their acceleration (n, 3)."""
 
     def status(self) -> str:
-        """Text for the progress line, after time and energy."""
+        """Return the text that the progress line shows after the time and the energy."""
 
     def series(self) -> dict[str, dict[str, list[float]]]:
-        """Tables for the product: values by table and column. Each column has one value for each call of `frame`."""
+        """Return tables for the product: values by name of the table and of the column. Each column has one value for
+        each call of `frame`."""
 
     def description(self) -> dict[str, float | str]:
-        """Settings of the method, for the attributes of the product."""
+        """Return the settings of the method, which become attributes of the product."""
 
     def state_dict(self) -> dict[str, Any]:
-        """The present state by name, to be passed to `CheckpointDirectory.write`. No name begins with "rollout"."""
+        """Return the present state by name, as `CheckpointDirectory.write` takes it. No name begins with "rollout"."""
 
     def load_state_dict(self, saved: Checkpoint) -> None:
         """Continue from a checkpoint, made on any number of ranks; exact on the same number of ranks."""
@@ -69,9 +73,10 @@ class TimeStep:
 
 
 def make_method(scene: Scene, step: TimeStep | None, truth: GroundTruth, start: int, directory: Path) -> Method:
-    """Make the method of a scene for a rollout that starts at a frame of the truth; collective.
+    """Make the method of a scene for a rollout that starts at the frame `start` of the truth; collective.
 
-    A given `step` replaces the step of the scene. The resolved velocity then does not limit the step.
+    A given `step` replaces the step of the scene; the resolved velocity then does not limit the step. `directory` is
+    the run directory.
     """
     settings, courant = scene.simulation, scene.time.courant
     if step is not None and settings.on_grid:
@@ -101,7 +106,7 @@ def make_method(scene: Scene, step: TimeStep | None, truth: GroundTruth, start: 
 
 
 def forcing_of(power: str | float, section: ForcingSection | None, truth: GroundTruth) -> Forcing | None:
-    """The forcing of a rollout, or None if the rollout is not forced.
+    """Return the forcing of a rollout, or None if the rollout is not forced.
 
     `power` is the key `injection` of [simulation]: "truth" for the forcing of the ground truth, "none" for no forcing,
     or a number, the power per mass. "dissipation" means the dissipation rate of the ground truth. Modes with

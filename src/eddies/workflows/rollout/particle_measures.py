@@ -18,17 +18,18 @@ from eddies.particles.particle_field import ParticleField
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.resolved_velocity import ResolvedVelocity
 
-MOST_ITERATIONS = 100  # largest number in a solve for a spectrum, see ParticleSpectra
+MOST_ITERATIONS = 100  # largest number of iterations in a solve for a spectrum, see ParticleSpectra
 GRADIENT = "velocity_gradient"
 
 
 class ReconstructedFields:
-    """A series of velocity fields on a grid, reconstructed from particles by a `Form`. It can be read like a
-    `FieldSeries`. Results for the last frame are kept.
+    """A series of velocity fields on a grid, reconstructed from particles by a `Form`.
+
+    It can be read like a `FieldSeries`. The results for the last frame that was read are kept.
 
     Parameters
     ----------
-    slab : the box on one rank; the grid of the fields has its planes. Grid point i is at i L / planes.
+    slab : the box on one rank. The grid has `slab.planes` points along each axis; point i is at i L / `slab.planes`.
     """
 
     variables = columns = ("velocity",)
@@ -39,12 +40,12 @@ class ReconstructedFields:
         self._kept: dict[str, tuple[int, Any]] = {}  # by name: frame of the last call, and its result
 
     def read(self, index: int, variable: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """The planes start, ..., stop - 1 of a frame: (3, stop - start, y, x)."""
+        """Return the planes start, ..., stop - 1 of a frame, (3, stop - start, y, x)."""
         whole = self._once("velocity", index, lambda: self._by_component(self.form.on_grid(self._field(index)), 3))
         return whole[:, start:stop]
 
     def gradients(self, frame: int) -> np.ndarray:
-        """Velocity gradients (n, 3, 3) [component, direction] at the particles."""
+        """Return the velocity gradients at the particles, (n, 3, 3) [component, direction]."""
         def made() -> np.ndarray:
             field = self._field(frame)
             return as_numpy(self.form.at(field, field.owned)[1])
@@ -52,7 +53,7 @@ class ReconstructedFields:
         return self._once("gradients", frame, made)
 
     def plane(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Velocity (3, y, x) and magnitude of the vorticity (y, x) at the grid points in the plane z = pi."""
+        """Return the velocity (3, y, x) and the magnitude of the vorticity (y, x) on the grid in the plane z = pi."""
         axis = torch.arange(self.slab.planes, dtype=torch.float64) * self.slab.spacing
         y, x = torch.meshgrid(axis, axis, indexing="ij")
         middle = torch.full_like(x, self.slab.planes // 2 * self.slab.spacing)
@@ -84,7 +85,7 @@ class ReconstructedFields:
 
 
 class WithGradients:
-    """Particles with one more column, the reconstructed `velocity_gradient` dv_i/dx_j."""
+    """A series of particles with one more column, the reconstructed `velocity_gradient` dv_i/dx_j."""
 
     def __init__(self, particles: Any, fields: ReconstructedFields) -> None:
         self._particles, self._fields, self.times = particles, fields, particles.times
@@ -100,8 +101,8 @@ class WithGradients:
 class ParticleSpectra:
     """Energy spectra of particles, from the modes that a least-squares fit finds in their velocities.
 
-    These modes are those of `ResolvedVelocity`, as in the closures of the particle model. No kernel attenuates them.
-    Their wavenumbers are the same for all methods, for model and for truth. Every solve starts from 0 and is in single
+    The modes are those of `ResolvedVelocity`, as in the closures of the particle model. No kernel attenuates them. The
+    wavenumbers are the same for all methods, for model and for truth. Every solve starts from 0 and is in single
     precision, like the stored frames.
 
     Particles without a force between them cluster and leave voids, where only the weak prior determines the modes. The
@@ -132,8 +133,8 @@ class ParticleSpectra:
         self.__dict__.pop("_resolution", None)
 
     def of(self, particles: Frames, frame: int, whose: str) -> np.ndarray:
-        """E(k) of the shells 0, 1, ... in which all modes are resolved, and of shell 1 in any case. `whose` names the
-        particles in `complaints`."""
+        """Return E(k) of the shells 0, 1, ... up to the last shell in which all modes are resolved; shell 1 is always
+        included. `whose` names the particles in `complaints`."""
         position, velocity = (particles.read(frame, name).astype(float) for name in ("position", "velocity"))
         with torch.no_grad():
             flow = self._resolution.of(ParticleSet.from_numpy(

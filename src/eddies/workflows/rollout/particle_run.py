@@ -27,22 +27,24 @@ from eddies.workflows.rollout.saved_particles import particle_state, restored_pa
 
 log = logging.getLogger("eddies")
 
-# A state is faulty if the speed of a particle exceeds RUNAWAY_SPEED times the rms velocity of the truth, or if its
-# density deviates from the mean by more than the mean itself and by more than RUNAWAY_DENSITY times the true rms.
+# A state is faulty if the speed of a particle exceeds RUNAWAY_SPEED times the rms velocity of the truth. It is also
+# faulty if the density of a particle deviates from the mean density by more than this mean and by more than
+# RUNAWAY_DENSITY times the true rms deviation.
 RUNAWAY_SPEED, RUNAWAY_DENSITY = 30.0, 300.0
 # Columns of the table on the solves for the resolved velocity; see `ParticleRun.series`.
 SOLVES = "solves", "iterations", "most_iterations", "residual", "not_converged"
 
 
 class ParticleRun:
-    """The particles of a frame of the ground truth, moved by a model, which may have no terms.
+    """Particles that start at a frame of the ground truth and are moved by a model. The model may have no terms.
 
     Particles without forces have no neighbour list and send no message.
 
     Parameters
     ----------
-    model : in the units of the flow at the release of the tracers, as in training.
+    model : the model in the units of the flow at the release of the tracers, as in training.
     seen : the range of network inputs in the training, None without networks.
+    start : number of the frame.
     limited : whether the resolved velocity limits the step; false if the step was found by rollouts.
     """
 
@@ -72,10 +74,11 @@ class ParticleRun:
         return self.dynamics.time
 
     def advance(self, until: float, number: int) -> str | None:
-        """Take one step towards the time `until`. Returns on all ranks the fault of the new state, or None.
+        """Take the step with this `number` towards the time `until`.
 
         The step is as long as the scene allows, or shorter if the flow demands it. A scheme with dense output may step
-        beyond `until`. Other schemes divide the time left to `until` into equal steps.
+        beyond `until`. Other schemes divide the time left to `until` into equal steps. Returns a text that describes
+        the fault of the new state, or None if there is no fault; the result is the same on all ranks.
         """
         step, left = min(self.settings.longest_step, self._allowed_step()), until - self.time
         if not self.integrator.scheme.dense:
@@ -92,7 +95,8 @@ class ParticleRun:
         return complaint
 
     def _allowed_step(self) -> float:
-        """The longest step that the resolved velocity allows in the present flow; infinite if it sets no limit."""
+        """Return the longest step that the resolved velocity allows in the present flow; infinite if it sets no
+        limit."""
         resolution = self.dynamics.resolution
         if resolution is None or not self.limited:
             return np.inf
@@ -100,14 +104,16 @@ class ParticleRun:
         return allowed_step(self.integrator.scheme.angle, highest, resolution.speed)
 
     def _complaint_of_rates(self, number: int) -> str | None:
-        """Return a complaint if a rate at the end of a step is not finite. The next frame and step use these rates."""
+        """Return a complaint if a rate at the end of step `number` is not finite. The next frame and the next step use
+        these rates."""
         self.particles, rates = self.integrator.rates(self.particles)
         wrong = self.particles.id[~torch.isfinite(rates.acceleration).all(1)].tolist()
         return first_complaint(self.comm, f"step {number}, rank {self.comm.rank}, particle {wrong[0]}: its "
                                           "acceleration is not finite" if wrong else None)
 
     def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
-        """The particles at a time within the last step, with the density that terms give, and their acceleration."""
+        """Return the particles at a time within the last step, and their acceleration. If terms give a density, the
+        particles have it."""
         if self._before is None:
             self.particles, rates = self.integrator.rates(self.particles)
             particles = self.particles
@@ -123,7 +129,7 @@ class ParticleRun:
         return particles, rates.acceleration
 
     def _now(self) -> Moment:
-        """The present particles and their rates. The next step reuses these rates. Collective."""
+        """Return the present particles and their rates. The next step reuses these rates. Collective."""
         self.particles, rates = self.integrator.rates(self.particles)
         return Moment.of(self.comm, self.total, self.time, self.particles, rates)
 
@@ -143,23 +149,25 @@ class ParticleRun:
                         len(solves), max(iterations), residuals.max())
 
     def status(self) -> str:
-        """Mean iterations of a solve for the resolved velocity between the last two frames, for the progress line."""
+        """Return a text for the progress line: the mean number of iterations of a solve for the resolved velocity
+        between the last two frames."""
         means = [iterations / count for count, iterations in zip(self._solves["solves"], self._solves["iterations"])
                  if count]
         return f"  iterations {means[-1]:.1f}" if means else ""
 
     def series(self) -> dict[str, dict[str, list[float]]]:
-        """Tables with a row for each frame.
+        """Return the tables, with a row for each frame.
 
-        `outside_training`: `share` of the pairs whose network inputs are outside the range of the training.
-        `closure`: columns SOLVES on the solves for the resolved velocity since the last frame: number of solves, sum of
-        their iterations, most iterations of one solve, largest residual, number of solves that did not converge.
+        `outside_training`: `share` of the pairs whose network inputs are outside the range of the training. `closure`:
+        columns SOLVES on the solves for the resolved velocity since the last frame. They are the number of solves, the
+        sum of their iterations, the most iterations of one solve, the largest residual, and the number of solves that
+        did not converge.
         """
         tables = {} if self.seen is None else {"outside_training": {"share": self._shares_outside}}
         return tables if self.dynamics.resolution is None else {**tables, "closure": self._solves}
 
     def state_dict(self) -> dict[str, Any]:
-        """The state for a checkpoint; collective. Call it after the frames of a step and before the next step."""
+        """Return the state for a checkpoint; collective. Call it after the frames of a step, before the next step."""
         return {**particle_state(self.particles, self.integrator), "series": {
             "outside_training": self._shares_outside, "closure": self._solves}}
 
@@ -169,6 +177,7 @@ class ParticleRun:
         self._shares_outside, self._solves = (saved["series"][name] for name in ("outside_training", "closure"))
 
     def description(self) -> dict[str, float | str]:
-        """Integrator, terms, whether they integrate a density, and the number of evaluations of the rates."""
+        """Return attributes of the product: integrator, terms, whether the terms integrate a density, and number of
+        evaluations of the rates."""
         return {"integrator": self.settings.scheme.name, "terms": ", ".join(self.model.terms) or "none",
                 "integrates_density": self.model.integrates_density, "evaluations": self.dynamics.evaluations}

@@ -1,5 +1,8 @@
-"""Particles in checkpoints. On the same number of ranks, each rank reads the rows that it saved, in the same order.
-Therefore a restart does not change the last bit of a sum over particles."""
+"""Particles in checkpoints.
+
+On the same number of ranks, each rank reads the rows that it saved, in the same order. Therefore a restart does not
+change the last bit of a sum over particles.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +25,10 @@ MEMORY, BUILT_AT = "memory ", "built at"
 
 
 def saved_rows(comm: Comm, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """The state of columns (n, ...) for a checkpoint, with the rows in the order of the ranks. `columns` holds at least
-    `id` and `position`. Collective."""
+    """Return the columns (n, ...) of this rank as a state for a checkpoint. Rows are stored in the order of the ranks.
+
+    `columns` holds at least `id` and `position`. Collective.
+    """
     rows = np.zeros(comm.size, np.int64)
     rows[comm.rank] = len(columns["id"])
     rows = global_sum(comm, rows)
@@ -33,8 +38,10 @@ def saved_rows(comm: Comm, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def restored_rows(slab: SlabDecomposition, saved: Checkpoint) -> tuple[dict[str, np.ndarray], bool]:
-    """The columns of this rank, and whether they are exactly the rows that it saved. On another number of ranks the
-    columns are those of the particles in this rank's slab. Collective."""
+    """Return the columns of this rank, and whether they are exactly the rows that this rank saved.
+
+    On another number of ranks the columns are those of the particles in this rank's slab. Collective.
+    """
     rows = saved["rows_of_ranks"]
     same = len(rows) == slab.size
     starts = np.concatenate([[0], np.cumsum(rows)]) if same else block_starts(int(rows.sum()), slab.size)
@@ -44,8 +51,11 @@ def restored_rows(slab: SlabDecomposition, saved: Checkpoint) -> tuple[dict[str,
 
 
 def particle_state(particles: ParticleSet, integrator: Integrator) -> dict[str, Any]:
-    """The state of particles for a checkpoint: the particles that the integrator returned last, the rates that it
-    keeps, the positions at which the neighbour list was built, and start values of the next solves. Collective."""
+    """Return the state of particles for a checkpoint; collective.
+
+    It has the particles that the integrator returned last, the rates that the integrator keeps, the positions at which
+    the neighbour list was built, and start values for the next solves.
+    """
     dynamics = integrator.dynamics
     columns = particles.to_numpy() | {MEMORY + name: as_numpy(rate) for name, rate in integrator.memory.items()}
     built_at = dynamics.built_at(particles)
@@ -64,8 +74,11 @@ def particle_state(particles: ParticleSet, integrator: Integrator) -> dict[str, 
 
 
 def restored_particles(saved: Checkpoint, integrator: Integrator, device: torch.device) -> ParticleSet:
-    """Inverse of `particle_state`, exact on the same number of ranks. On another number the particles move to their
-    slabs, and the neighbour list is built again. Collective."""
+    """Restore the state of `particle_state` and return the particles; collective.
+
+    The result is exact on the same number of ranks. On another number the particles move to their slabs, and the
+    neighbour list is built again.
+    """
     dynamics = integrator.dynamics
     slab, state = dynamics.decomposition, {"time": torch.tensor(saved["time"], dtype=torch.float64)}
     if dynamics.resolution is not None:

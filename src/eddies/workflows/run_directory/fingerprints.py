@@ -1,4 +1,4 @@
-"""The dependence of products on the scene: fingerprints, and the provenance that a product keeps."""
+"""How products depend on the scene: fingerprints of stages, and the provenance that is stored in a product."""
 
 from __future__ import annotations
 
@@ -17,15 +17,17 @@ from eddies.scene.sections import SET_KEYS
 from eddies.scene.values import import_paths
 
 
-# The keys that only set the duration of a stage. If nothing else differs, a stage can continue from a checkpoint.
+# The keys that only set the duration of a stage. If nothing else differs, the stage can continue from a checkpoint.
 DURATION_KEYS = {"dns": ("tracers.turnovers", "time.duration")}
 
 
 def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> str:
-    """Return the SHA-256 of the inputs of a stage's product. `without` names keys to leave out, such as DURATION_KEYS.
+    """Return the SHA-256 checksum of all inputs of a stage's product. `without` names keys to leave out, such as
+    DURATION_KEYS.
 
-    It covers the settings of the stage and of those it depends on, the content of the files that the flow, the weights
-    and the step come from, the source of the user's classes, and the fingerprints of other ground truths.
+    The inputs are the settings of the stage and of the stages on which it depends, the content of the files from which
+    the flow, the weights and the step come, the source code of the user's classes, and the fingerprints of ground
+    truths of other runs.
     """
     training, simulation = scene.training, scene.simulation
     settings: dict[str, Any] = asdict(scene) | {
@@ -56,27 +58,33 @@ def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> 
 
 
 def set_files(scene: Scene) -> dict[Path, str]:
-    """Return the fingerprint of each tracer set's ground truth, by the file's path relative to the run directory."""
+    """Return the fingerprint of each tracer set's ground truth. The keys are the paths of these files, relative to the
+    run directory."""
     return {Path(name) / STAGES["dns"].file: stage_fingerprint(own, "dns") for name, own in scene.tracer_sets.items()}
 
 
 def stage_provenance(scene: Scene, stage: str) -> dict[str, Any]:
-    """Return what the product of a stage keeps of the scene: its text, the stage's fingerprint, the kinds of the
-    products that it is made from and, if the scene names any, the origins of the user's classes."""
+    """Return what the product of a stage stores about the scene.
+
+    This is the text of the scene, the fingerprint of the stage, the kinds of the products from which the product is
+    made and, if the scene names classes of the user, their origins.
+    """
     foreign = {"foreign": origins(scene.foreign)} if scene.foreign else {}
     return {"scene": scene.to_toml(), "fingerprint": stage_fingerprint(scene, stage),
             "made_from": [each.product for each in scene.inputs(stage)], **foreign}
 
 
 def _without(value: Any, section: str, keys: Sequence[str]) -> Any:
-    """A section without `keys`, which have the form "section.key". A value that is no section is not changed."""
+    """Return a section without `keys`, which have the form "section.key". A value that is not a section is returned
+    unchanged."""
     if not isinstance(value, dict):
         return value
     return {key: each for key, each in value.items() if f"{section}.{key}" not in keys}
 
 
 def _fingerprints(paths: Sequence[Path]) -> list[str | None]:
-    """The fingerprints stored in ground truths; None for a missing file. The files may be too large to digest."""
+    """Return the fingerprints stored in ground truths; None for a missing file. A checksum of the whole files would
+    take too long."""
     if not paths:
         return []
     from eddies.io.provenance import product_fingerprint  # imports h5py and mpi4py
@@ -84,7 +92,7 @@ def _fingerprints(paths: Sequence[Path]) -> list[str | None]:
 
 
 def _digest(path: str | Path | None) -> str | None:
-    """The SHA-256 of a file's content; None if there is no such file."""
+    """Return the SHA-256 checksum of a file's content; None if there is no such file."""
     if path is None or not Path(path).is_file():
         return None
     state = Path(path).stat()

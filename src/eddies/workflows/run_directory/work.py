@@ -1,5 +1,7 @@
-"""The work that a run directory holds: products and checkpoints. Work that fits the scene's settings is kept or
-continued; other work would be replaced."""
+"""The work that a run directory holds: products and checkpoints.
+
+Work that fits the settings of the scene is kept or continued. Other work would be replaced.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,7 @@ MOST_CHANGES = 3  # largest number of changed settings that a message names
 
 
 class WouldReplaceWork(UserError):
-    """A command would replace work of other settings."""
+    """A command would replace work that was made with other settings."""
 
 
 @dataclass(frozen=True)
@@ -59,11 +61,11 @@ class Work:
 
 def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Collection[str] = (),
               overwrite: bool = True) -> Work:
-    """Find what a run directory already holds of the stages of a scene; one rank calls it. `links` are further stages,
-    whose products are links to other directories.
+    """Find the work of a scene's stages that a run directory already holds; one rank calls it.
 
-    Raises WouldReplaceWork if work would be replaced and `overwrite` is false. Raises ProductError if the system
-    refuses to read a product or a checkpoint, because the file may be undamaged.
+    `links` are further stages, whose products are links to other directories. Raises WouldReplaceWork if work would be
+    replaced and `overwrite` is false. Raises ProductError if the system refuses to read a product or a checkpoint: such
+    a file may be undamaged, and must not be replaced.
     """
     done, begun, obsolete, lost, changes = set(), set(), set(), [], {}
     seconds = stage_seconds(directory)
@@ -78,7 +80,7 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
         of_sets = {path: product_provenance(directory / path) for path in sets}
         if complete and all(of_sets[path].get("fingerprint") == fingerprint for path, fingerprint in sets.items()):
             done.add(stage.name)
-            # Checkpoints of other settings may still be continued; those of a direct simulation serve a longer one.
+            # Checkpoints of other settings may still be continued. Those of a direct simulation serve a longer run.
             if not of_others and stage.name != "dns":
                 obsolete.add(stage.name)
             continue
@@ -130,7 +132,7 @@ def link_products(products: Mapping[Path, str], directory: Path) -> None:
 
 
 def _scene_of(directory: Path) -> str | None:
-    """The text of the scene that ran last in a directory; None if it cannot be read."""
+    """Return the text of the scene that ran last in a directory; None if it cannot be read."""
     try:
         return (directory / "scene.toml").read_text(encoding="utf-8")
     except (OSError, ValueError):
@@ -138,22 +140,22 @@ def _scene_of(directory: Path) -> str | None:
 
 
 def step_path(settings: Simulation, directory: Path) -> Path | None:
-    """The file with the step of a rollout, in its run directory or in that of [simulation] step_from; None if the step
-    is a number."""
+    """Return the file that holds the converged step of a rollout: in `directory`, its run directory, or in the one that
+    [simulation] step_from names. None if the step is a number."""
     if settings.step != CONVERGED:
         return None
     return settings.step_file or directory / STAGES["find-step"].file
 
 
 def read_found_step(path: Path, comm: Comm) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The attributes of a found step, and the table of the trials with the same integrator; all ranks call it."""
+    """Read the attributes of a converged step, and the table of the trials with its integrator; all ranks call it."""
     with open_product(comm, path, "step") as file:
         found = read_attributes(file, "found")
         return found, read_table(file, f"trials/{found['integrator']}")
 
 
 def stage_seconds(directory: Path) -> dict[str, float]:
-    """Wall time of each stage in earlier runs; empty if the file is missing or damaged."""
+    """Return the wall time of each stage in earlier runs, in seconds; empty if the file is missing or damaged."""
     try:
         return read_stage_seconds(directory)
     except (OSError, ProductError):
@@ -161,7 +163,8 @@ def stage_seconds(directory: Path) -> dict[str, float]:
 
 
 def read_stage_seconds(directory: Path) -> dict[str, float]:
-    """Wall time of each stage in earlier runs; empty if the file is missing. ProductError if it is damaged."""
+    """Return the wall time of each stage in earlier runs, in seconds; empty if the file is missing. Raises ProductError
+    if the file is damaged."""
     path = directory / SECONDS
     if not path.exists():
         return {}
@@ -172,8 +175,10 @@ def read_stage_seconds(directory: Path) -> dict[str, float]:
 
 
 def changed_settings(stage: Stage, then: str | None, now: str | None) -> list[str]:
-    """The settings of a stage's product that differ between two scenes, as text with both values. `then` and `now` are
-    the scenes as TOML; the list is empty if one of them is missing or damaged."""
+    """Return the settings that differ between two scenes and affect the product of a stage, as text with both values.
+
+    `then` and `now` are the scenes as TOML. The list is empty if one of them is missing or damaged.
+    """
     stages = [STAGES[name] for name in (*stage.depends_on, stage.name)]
     try:
         before, after = (dict(dotted(tomllib.loads(text or ""))) for text in (then, now))
@@ -187,7 +192,7 @@ def changed_settings(stage: Stage, then: str | None, now: str | None) -> list[st
 
 
 def of_other_settings(changes: Sequence[str]) -> str:
-    """The words "other settings", followed by the first of the changes."""
+    """Return the words "other settings", followed by the first few of `changes`."""
     listed = [*changes[:MOST_CHANGES], *(["..."] if changes[MOST_CHANGES:] else [])]
     return "other settings" + (f" ({', '.join(listed)})" if listed else "")
 
