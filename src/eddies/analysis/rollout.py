@@ -122,7 +122,7 @@ class Rollout:
     outside_training : share of the particle pairs for which an input of a network is outside its range in training,
         (frames,); None if it was not counted.
     closure : columns (frames,) `solves`, `iterations`, `most_iterations`, `residual` and `not_converged` of the
-        iterative solves for the resolved velocity; None if there were no solves.
+        iterative solves for the resolved velocity since the previous frame; None if there were no solves.
     reconstructed_by : name of the reconstruction method, for captions.
     """
 

@@ -4,7 +4,7 @@ import contextlib
 import os
 import sys
 
-# The report needs no backend, and an unknown value of MPLBACKEND would end the import of matplotlib.
+# The report needs no backend, and the import of matplotlib would fail with an unknown value of MPLBACKEND.
 if "matplotlib" not in sys.modules and (backend := os.environ.pop("MPLBACKEND", None)):
     try:
         import matplotlib

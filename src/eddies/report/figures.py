@@ -1,4 +1,4 @@
-"""Colours, fonts, panels, planes and guide lines that all figures share."""
+"""Colours and fonts of all figures, and functions that draw parts of figures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from matplotlib.transforms import Bbox
 
 from eddies.analysis.pdfs import bin_centres, gaussian, pdf, standardized
 
-# The palette of Okabe and Ito, safe for colour-blind readers. A quantity has one colour in all figures.
+# The palette of Okabe and Ito, which colour-blind readers can distinguish. A quantity has one colour in all figures.
 DNS, FILTERED, TRUTH, MODEL = "#000000", "#7f7f7f", "#0072B2", "#D55E00"
 SECOND, THIRD, FOURTH = "#009E73", "#CC79A7", "#E69F00"
 GUIDE, NOTE = "#9a9a9a", "#5a5a5a"
@@ -29,7 +29,7 @@ STYLE = {
     "font.size": 10.5, "axes.titlesize": 10.5, "axes.labelsize": 10.5, "legend.fontsize": 9,
     "xtick.labelsize": 9, "ytick.labelsize": 9, "font.family": "DejaVu Sans",
     "mathtext.fontset": "dejavusans",
-    "axes.titley": 1.0,  # a fixed place: an automatic one measures all tick labels again
+    "axes.titley": 1.0,  # a fixed height; for an automatic one, all tick labels would be measured again
     "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.8, "lines.linewidth": 1.7,
     "axes.formatter.limits": (-4, 4),  # wider tick labels get a common factor
     "legend.frameon": False, "figure.dpi": 150, "savefig.dpi": 150, "axes.prop_cycle": matplotlib.cycler(
@@ -40,7 +40,7 @@ PLAIN = {key: value for key, value in matplotlib.rcParamsDefault.items() if key 
 
 
 def styled(draw: Callable) -> Callable:
-    """Run a drawing function under the common style, whatever the user's matplotlib settings are."""
+    """Return a drawing function that uses the common style, whatever the user's matplotlib settings are."""
     @functools.wraps(draw)
     def drawn(*arguments, **named):
         with matplotlib.rc_context({**PLAIN, **STYLE}):
@@ -52,8 +52,9 @@ def panels(rows: int, columns: int, size: tuple[float, float], right: float = 0.
            foot: float = 0.0, **sharing) -> tuple[Figure, np.ndarray]:
     """Return a figure and its axes (rows, columns), with fixed margins for labels and titles.
 
-    All lengths are in inches. size: that of a panel with its labels. right: room for colour bars, beside each panel or,
-    with `sharey`, beside the last one. below: room for a legend below each panel. foot: room for one below all panels.
+    All lengths are in inches. size: width and height of a panel with its labels. right: room for colour bars, beside
+    each panel or, with `sharey`, beside the last one. below: room for a legend below each panel. foot: room for a
+    legend below all panels. sharing: `sharex` and `sharey` of `Figure.subplots`.
     """
     width, height = size[0] * columns, size[1] * rows
     figure = Figure(figsize=(width, height + foot))
@@ -74,12 +75,12 @@ def panels(rows: int, columns: int, size: tuple[float, float], right: float = 0.
 
 
 def legend_at_foot(figure: Figure, axis: Axes, columns: int) -> None:
-    """Put the legend of a panel at the foot of the figure, where `panels` leaves room by `foot`."""
+    """Put the legend of a panel at the foot of the figure, where the argument `foot` of `panels` has left room."""
     figure.legend(*axis.get_legend_handles_labels(), loc="lower center", ncols=columns)
 
 
 def letter(axes: Sequence[Axes]) -> None:
-    """Name the panels A, B, C... before their titles."""
+    """Write the letters A, B, C, ... before the titles of the panels. A single panel gets no letter."""
     if len(axes) > 1:
         for name, panel in zip("ABCDEFGHIJKLMNOP", axes):
             title = panel.get_title()
@@ -91,8 +92,7 @@ def letter(axes: Sequence[Axes]) -> None:
 def png(figure: Figure) -> bytes:
     """Return the figure as a PNG image.
 
-    Logarithmic axes get plain text as labels. If they span two decades or more, they get no minor ticks. Both save
-    much time.
+    To save time, logarithmic axes get plain text as labels and, if they span two decades or more, no minor ticks.
     """
     for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis) if axis.get_scale() == "log"):
         low, high = sorted(axis.get_view_interval())
@@ -123,7 +123,10 @@ def largest(*arrays: np.ndarray) -> float:
 
 
 def draw_pdfs(axis: Axes, truth: np.ndarray, model: np.ndarray, edges: np.ndarray) -> None:
-    """Draw the PDFs of true and modelled values, in units of the truth's standard deviation, and a Gaussian."""
+    """Draw the PDFs of true and modelled values, and a Gaussian.
+
+    Values are standardised with the mean and the standard deviation of the truth. `edges` are the bins for them.
+    """
     centres = bin_centres(edges)
     densities = (pdf(standardized(values, truth), edges) for values in (truth, model))
     true, modelled = (np.where(density > 0, density, np.nan) for density in densities)
@@ -135,7 +138,10 @@ def draw_pdfs(axis: Axes, truth: np.ndarray, model: np.ndarray, edges: np.ndarra
 
 
 def show_plane(axis: Axes, plane: np.ndarray, limits: tuple[float, float], colours: str):
-    """Draw a plane [y, x] of the box with given colour limits; return the image for a colour bar."""
+    """Draw values in a plane [y, x] of the box, and return the image for a colour bar.
+
+    `limits` are the values at the ends of the colour map `colours`.
+    """
     length = 2 * np.pi
     image = axis.imshow(plane, origin="lower", extent=(0, length, 0, length), cmap=colours, vmin=limits[0],
                         vmax=limits[1], interpolation="bilinear", aspect="equal")
@@ -148,7 +154,7 @@ def show_plane(axis: Axes, plane: np.ndarray, limits: tuple[float, float], colou
 
 
 def colour_bar(figure: Figure, image, axes: Sequence[Axes], label: str, extend: str = "both"):
-    """Draw one colour bar to the right of all panels of `axes`, where `panels` leaves room, and return it."""
+    """Draw one colour bar to the right of all panels of `axes`, where `panels` has left room, and return it."""
     box = Bbox.union([axis.get_position() for axis in axes])
     place = (box.x1 + 0.12 / figure.get_figwidth(), box.y0 + 0.03 * box.height, 0.13 / figure.get_figwidth(),
              0.94 * box.height)
@@ -158,7 +164,7 @@ def colour_bar(figure: Figure, image, axes: Sequence[Axes], label: str, extend: 
 
 
 def guide_power_law(axis: Axes, wavenumber: Sequence[float], level: float, exponent: float, label: str) -> None:
-    """Draw a dashed power law that starts at (wavenumber[0], level), with a label in its middle."""
+    """Draw a dashed power law that starts at (wavenumber[0], level), and write a label beside its middle."""
     wavenumber = np.asarray(wavenumber, dtype=float)
     values = level * (wavenumber / wavenumber[0]) ** exponent
     axis.plot(wavenumber, values, color=GUIDE, linestyle="--", linewidth=1.1)
@@ -167,7 +173,10 @@ def guide_power_law(axis: Axes, wavenumber: Sequence[float], level: float, expon
 
 
 def note(axis: Axes, text: str, place: tuple[float, float], coordinates, offset: tuple[float, float], **style) -> None:
-    """Write a small grey text at a place, moved by an offset in points."""
+    """Write a small grey text at a place of a panel, moved by an offset in points (1/72 inch).
+
+    `coordinates` is matplotlib's name for the coordinates of `place`.
+    """
     axis.annotate(text, place, xycoords=coordinates, xytext=offset, textcoords="offset points", color=NOTE,
                   **{"fontsize": 9, **style})
 
@@ -193,6 +202,6 @@ def legend_below(axis: Axes, columns: int) -> None:
 
 
 def mark_time(axis: Axes, time: float, label: str) -> None:
-    """Draw a thin vertical line at a time, with a label at its top."""
+    """Draw a thin vertical line at a time, with a label at the top of the line."""
     axis.axvline(time, color=GUIDE, linewidth=1, linestyle=":")
     note(axis, label, (time, 1), ("data", "axes fraction"), (3, -2), va="top", fontsize=8.5)

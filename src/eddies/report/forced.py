@@ -1,4 +1,4 @@
-"""The section on a forced rollout: its statistics beside those of the stationary state of the ground truth."""
+"""The report section on a forced rollout: its statistics, and those of the stationary state of the ground truth."""
 
 from collections.abc import Sequence
 
@@ -21,10 +21,10 @@ SERIES = {"energy": "kinetic energy", "acceleration_rms": "rms of an acceleratio
 
 
 def averages(run: Frames, frames: np.ndarray, turnover: float, whose: str) -> dict[str, dict[str, float]]:
-    """Return a table of statistics over `frames` for each name in SERIES.
+    """Return statistics over `frames` for each name in SERIES.
 
-    The keys of a table are the text `whose`, for the mean, "standard error", "trend per turnover", "error of the
-    trend", and "deviation", for the standard deviation in time.
+    The mean has the text `whose` as its key. The other keys are "standard error", "trend per turnover", "error of the
+    trend", and "deviation" for the standard deviation in time.
     """
     blocks, found = Blocks.of(run.times[frames] / turnover, 1.0), {}
     samples = {"energy": np.array([mean_energy(run, frame) for frame in frames]),
@@ -37,7 +37,7 @@ def averages(run: Frames, frames: np.ndarray, turnover: float, whose: str) -> di
 
 
 def invariant_divergence(model: Sequence[Invariants], flow: Invariants) -> float:
-    """Forward KL divergence between two joint PDFs of Q and R: that of the flow, and that of all frames of the model.
+    """Return the forward KL divergence between the joint PDFs of Q and R in the flow and in all frames of the model.
 
     Q and R of each frame are in units of its own <Q_w> and <Q_w>^(3/2).
     """
@@ -99,7 +99,7 @@ def section(run: Rollout, span: StationarySpan) -> Section:
 
 
 def _transfer(run: Rollout, span: StationarySpan) -> np.ndarray:
-    """Return the fraction of the energy of each shell that the filter keeps."""
+    """Return, for each shell, the fraction of its energy that the filter keeps, (shells,)."""
     return gaussian_transfer(np.arange(span.spectra.shape[1]) ** 2, run.filter_width) ** 2
 
 
@@ -110,7 +110,10 @@ def filtered_energy(run: Rollout, span: StationarySpan) -> tuple[Estimate, float
 
 
 def mean_spectra(run: Rollout, span: StationarySpan) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], Estimate]:
-    """Return wavenumbers, mean spectra (shells,) of filtered flow and model, and the spectrum error of the model."""
+    """Return the wavenumbers, the mean spectra of filtered flow and model, and the spectrum error of the model.
+
+    The wavenumbers and each spectrum are (shells,).
+    """
     chosen = run.late_spectra()
     spectra = np.array([run.spectra["model"][int(frame)] for frame in chosen])
     known = min(spectra.shape[1], span.spectra.shape[1])
@@ -131,7 +134,8 @@ def forced_rollout(series: tuple[np.ndarray, np.ndarray], flow: tuple[float, flo
     """Draw energy over time, mean spectra and acceleration PDFs of the model and of the stationary flow.
 
     series: time / T and energy of the model. flow: mean and standard deviation of the energy of the flow. spectra:
-    wavenumbers, and the spectra of flow and model. cutoff: k_d. accelerations: those of flow and model, standardised.
+    wavenumbers, and the spectra of flow and model. cutoff: filter wavenumber k_d. accelerations: those of flow and
+    model, standardised.
     """
     figure, ((energy, spectrum, density),) = panels(1, 3, (3.6, 3.1))
     mean, deviation = flow

@@ -1,4 +1,4 @@
-"""The section on the ground truth: history of its statistics, energy spectra, fields."""
+"""The report section on the ground truth: history of its statistics, energy spectra, fields."""
 
 from collections.abc import Mapping
 
@@ -28,7 +28,8 @@ HISTORY = (
         ("skewness", "skewness", TRUTH, "-"),
         ("flatness", "flatness", MODEL, "--"))),
 )
-LOGARITHMIC, SMALLEST = "Compressibility", 1e-8  # smaller values are rounding errors and would stretch the axis
+# The panel with a logarithmic axis, and the smallest value in it: smaller ones are only rounding errors.
+LOGARITHMIC, SMALLEST = "Compressibility", 1e-8
 METRICS = {
     "reynolds_lambda": "Taylor Reynolds number Re_λ", "kmax_eta": "resolution k_max η",
     "mach_turbulent": "turbulent Mach number M_t",
@@ -43,12 +44,13 @@ METRICS = {
 
 def section(statistics: Table, spectra: Table, reference: Mapping[str, float], planes: Table,
             field_name: str, source: str) -> Section:
-    """Return the section from the tables `statistics` and `spectra` and the attributes `reference`.
+    """Return the section, with numbers at the release of the tracers, or at the end if there are no tracers.
 
-    Numbers are those at the release of the tracers, or at the end if there are no tracers. planes: arrays [y, x] of the
-    last stored field at z = pi; "velocity" is u_x, and "vorticity" the magnitude of the vorticity. field_name: the kind
-    of this field, "filtered" or "final". Times in `spectra` count from the release of the tracers, and times in
-    `statistics` from the start of the simulation. source: where the flow comes from.
+    statistics, spectra, reference: the tables and the attributes with these names in ground_truth.h5. Times in
+    `spectra` count from the release of the tracers, and times in `statistics` from the start of the simulation.
+    planes: arrays [y, x] of the last stored field at z = pi; "velocity" is u_x, and "vorticity" the magnitude of the
+    vorticity. field_name: the kind of this field, "filtered" or "final". source: a sentence on where the flow comes
+    from.
     """
     released, times = reference.get("released_at"), statistics["time"]
     row = -1 if released is None else int(np.argmin(np.abs(times - released)))
@@ -79,7 +81,9 @@ def section(statistics: Table, spectra: Table, reference: Mapping[str, float], p
 
 @styled
 def statistics_history(statistics: Table, release: float | None) -> Figure:
-    """Draw columns (samples,) over time and mark the release of the tracers; panels without finite values are left out.
+    """Draw the columns (samples,) of `statistics` over time, and mark the time `release` of the tracers.
+
+    Panels without finite values are left out. Without tracers, `release` is None.
     """
     known = {name for name, values in statistics.items() if np.isfinite(values).any()}
     shown = [(title, label, [line for line in lines if line[0] in known]) for title, label, lines in HISTORY]
@@ -110,7 +114,7 @@ def energy_spectra(wavenumber: np.ndarray, energy: np.ndarray, filtered: np.ndar
                    filter_width: float | None) -> Figure:
     """Draw the energy spectra (shells,) of the flow and of the filtered flow at one time.
 
-    Without tracers `filtered` and `filter_width` are None.
+    Without tracers, `filtered` and `filter_width` are None.
     """
     inside = (wavenumber >= 1) & (energy > 1e-12 * energy.max())
     k, spectrum = wavenumber[inside], energy[inside]

@@ -1,4 +1,4 @@
-"""The section on smoothing kernels: shapes (the paper's Fig. 1) and reconstructed fields (Fig. 2)."""
+"""The report section on smoothing kernels: their shapes (the paper's Fig. 1), and reconstructed fields (Fig. 2)."""
 
 from collections.abc import Mapping
 
@@ -28,7 +28,10 @@ ERRORS = {  # name of a reconstruction in the files: start of its keys in the re
 
 @styled
 def shapes(kernels: Mapping[str, np.ndarray]) -> Figure:
-    """Draw h^3 W and h^4 dW/dr over r/h, from the columns r_over_h, value_NAME and derivative_NAME, NAME in KERNELS."""
+    """Draw h^3 W and h^4 dW/dr of each kernel W over r/h; h is the support radius.
+
+    The columns are r_over_h, value_NAME and derivative_NAME, with a NAME in KERNELS.
+    """
     figure, axes = panels(1, 2, (4.4, 3.3))
     for axis, kind in zip(axes.flat, ("value", "derivative")):
         axis.axhline(0, color="#cccccc", linewidth=0.8)
@@ -46,10 +49,11 @@ def shapes(kernels: Mapping[str, np.ndarray]) -> Figure:
 
 @styled
 def reconstructed_planes(slices: Mapping[str, np.ndarray], errors: Mapping[str, float]) -> Figure:
-    """Draw planes [y, x] of u_x and du_x/dx, truth and reconstructions, with one colour scale per row.
+    """Draw planes [y, x] of u_x, and below them of du_x/dx: first the truth, then the reconstruction by each kernel.
 
-    The keys of `slices` are truth_QUANTITY and QUANTITY_NAME, and those of `errors` are QUANTITY_error_NAME. QUANTITY
-    is velocity or gradient, and NAME is a name in KERNELS.
+    A row of planes has one colour scale. The Wendland kernel is left out. The keys of `slices` are truth_QUANTITY and
+    QUANTITY_NAME, and those of `errors` are QUANTITY_error_NAME. QUANTITY is velocity or gradient, and NAME is a name
+    in KERNELS. The errors are written in the titles.
     """
     names = [name for name in KERNELS if f"velocity_{name}" in slices and name != "wendland"]
     figure, axes = panels(2, 1 + len(names), (2.665, 2.675), right=BAR, sharex=True, sharey=True)
@@ -71,7 +75,11 @@ def reconstructed_planes(slices: Mapping[str, np.ndarray], errors: Mapping[str, 
 
 def section(support: float, kernels: Mapping[str, np.ndarray], slices: Mapping[str, np.ndarray],
             errors: Mapping[str, float]) -> Section:
-    """Return the section from the tables of the product; errors are those on an unseen field."""
+    """Return the section.
+
+    support: support radius of the kernels. kernels, slices, errors: the tables with these names in kernel.h5. Errors
+    are those on a field that the training has not used.
+    """
     def error(key: str, label: str, column: str) -> Metric:
         return Metric(key, label, float(errors[column]) if column in errors else None, "this kernel was not compared")
 

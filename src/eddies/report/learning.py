@@ -16,7 +16,7 @@ LOSSES = (
     ("acceleration_kl_loss", "acceleration KL", FOURTH), ("rollout_loss", "velocity over the horizon", THIRD),
     ("energy_loss", "energy over the horizon", "#56B4E9"), ("power_loss", "power", "#8c564b"),
 )
-SMOOTHED = 0.04  # share of a phase's steps over which noisy curves are averaged
+SMOOTHED = 0.04  # share of the steps of a phase over which a noisy curve is averaged
 
 
 @styled
@@ -44,7 +44,7 @@ def curves(history: Mapping[str, np.ndarray]) -> Figure:
 
 
 def _mark_phases(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
-    """Draw lines between the phases, and label ticks with steps and wall time."""
+    """Draw vertical lines between the phases, and label ticks with numbers of steps and wall times."""
     phases = round(history["place"][-1])
     for end in range(1, phases):
         axis.axvline(end, color=GUIDE, linestyle=":", linewidth=1.0)
@@ -56,9 +56,10 @@ def _mark_phases(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
 
 
 def _validation(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
-    """Draw one line of errors for each phase, because the measures of the phases differ, and circle its minimum.
+    """Draw a line of validation errors for each phase, and a circle at the minimum of each line.
 
-    A line begins with the error before the first step of the phase.
+    Phases have separate lines because they measure errors in different ways. A line begins with the error before the
+    first step of the phase.
     """
     axis.set(title="Validation error, minima circled", ylabel="validation error")
     missing, highest = np.full(len(history["step"]), np.nan), 0.0
@@ -77,7 +78,7 @@ def _validation(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
 
 
 def _noisy(axis: Axes, history: Mapping[str, np.ndarray], name: str, colour: str, label: str) -> None:
-    """Draw a faint curve of single steps and, over it, its running mean within each phase."""
+    """Draw a faint curve of the values of single steps and, over this curve, its running mean within each phase."""
     values = history[name]
     for number in np.unique(history["phase"]):
         used = (values > 0) & (history["phase"] == number)

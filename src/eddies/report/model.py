@@ -1,4 +1,4 @@
-"""The section on the model: a-priori errors and PDFs (the paper's Fig. 3), training, coefficients, other flows."""
+"""The report section on the model: a-priori errors and PDFs (the paper's Fig. 3), training, learned coefficients."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -39,11 +39,12 @@ TRAINING = {
 
 def section(description: Mapping[str, Any], table: Table, acceleration: Table, density_rate: Table | None,
             history: Table | None, source: str | None = None, others: Sequence[str] = ()) -> Section:
-    """Return the section with the errors at the last frame, from the tables of the product.
+    """Return the section. Its errors are those of the a-priori test at the last frame.
 
-    source: path of the run that the weights and the history come from; None if it is this run.
-    history: None if nothing was trained. others: the ground truths that the model was trained on; empty if the ground
-    truth of this run, or of the run `source`, is among them.
+    description: that of model.h5. table: a-priori errors, (frames,). acceleration, density_rate: see `a_priori`.
+    history: columns over the steps of the training; None if nothing was trained. source: path of the run that the
+    weights and the history come from; None if it is this run. others: the ground truths that the model was trained on;
+    empty if the ground truth of this run, or of the run `source`, is among them.
     """
     last = int(np.argmax(table["delay"]))
     at = {name: float(values[last]) for name, values in table.items()}
@@ -80,7 +81,7 @@ def section(description: Mapping[str, Any], table: Table, acceleration: Table, d
 
 
 def training_metrics(description: Mapping[str, Any]) -> list[Metric]:
-    """Return wall time and steps of the training, and the validation error at the end of each phase."""
+    """Return the wall time and the steps of the training, and the validation error at the end of each phase."""
     if "training" not in description:
         return [Metric(key, label, None, "not stored with these weights") for key, label in TRAINING.items()]
     phases = description["training"]
@@ -91,14 +92,14 @@ def training_metrics(description: Mapping[str, Any]) -> list[Metric]:
 
 
 def coefficient_metrics(description: Mapping[str, Any]) -> list[Metric]:
-    """Return the learned coefficients that the terms declare."""
+    """Return the learned coefficients that the terms of the model declare."""
     return [Metric(f"{term} {each['name']}", f"{term}, {each['name']}: {each['meaning']}",
                    {key: each[key] for key in ("learned", "value", "unit", "meaning")}, written=_written(each))
             for term, found in description.get("coefficients", {}).items() for each in found]
 
 
 def _written(coefficient: Mapping[str, Any]) -> str:
-    """Write a coefficient as it was learned and, unless its unit is 1, in the units of the flow."""
+    """Return the text of a coefficient: its value as learned and, unless its unit is 1, in the units of the flow."""
     learned, value = (", ".join(map(shown, found if isinstance(found, list) else [found]))
                       for found in (coefficient["learned"], coefficient["value"]))
     return learned if coefficient["unit"] == "1" else f"{learned}, that is {value} {coefficient['unit']}"
@@ -106,9 +107,10 @@ def _written(coefficient: Mapping[str, Any]) -> str:
 
 def source_metrics(mach: float | None, errors: Table, source_mach: float | None,
                    source_errors: Table) -> list[Metric]:
-    """Return M_t and the mean error after the training window: of this flow, and of the flow that was trained on.
+    """Return the turbulent Mach number M_t and the mean error of this flow, and those of the flow of the training.
 
-    errors, source_errors: the tables of a-priori errors. An M_t is None for an incompressible fluid.
+    mach, errors: M_t and the table of a-priori errors of this flow. source_mach, source_errors: those of the flow of
+    the training. An M_t is None for an incompressible fluid. The means are over the frames after the training window.
     """
     def unseen(table: Table) -> float | None:
         chosen = table["acceleration_error"][table["delay"] > 0]
@@ -125,9 +127,10 @@ def source_metrics(mach: float | None, errors: Table, source_mach: float | None,
 
 @styled
 def a_priori(table: Table, acceleration: Table, density_rate: Table | None) -> Figure:
-    """Draw errors over the delay after training, and PDFs of truth and prediction at the last frame.
+    """Draw errors over the delay after the training window, and PDFs of truth and prediction at the last frame.
 
-    table: columns (frames,). acceleration: truth and predicted (m, 3). density_rate: the same (m,), or None.
+    table: columns (frames,). acceleration: columns `truth` and `predicted`, each (m, 3). density_rate: the same two
+    columns, each (m,); None for a model without a density rate.
     """
     figure, axes = panels(1, 2 if density_rate is None else 3, (3.6, 3.8), below=0.95)
     _errors_panel(axes[0, 0], table)

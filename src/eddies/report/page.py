@@ -1,4 +1,4 @@
-"""The report as one HTML page that needs no other file, with its metrics as JSON."""
+"""The report as one HTML page that needs no other file, and its metrics as JSON."""
 
 import base64
 import json
@@ -20,9 +20,9 @@ Number = float | int | bool | str | dict | None
 class Metric:
     """One number of the report, or several.
 
-    key: its name in metrics.json. label: its name on the page. value: the number, or numbers by name; a number that is
-    not finite becomes None. reason: why there is no value. written: the text of the value on the page, if it differs
-    from `shown(value)`.
+    key: its name in metrics.json. label: its name on the page. value: the number, or several numbers by name; a number
+    that is not finite becomes None. reason: why there is no value. written: the text of the value on the page; empty
+    if it is that of the function `shown`.
     """
 
     key: str
@@ -42,9 +42,10 @@ class Metric:
 
 @dataclass
 class Illustration:
-    """A figure of the page: name of its file without the ending, title, matplotlib figure, caption.
+    """A figure of the page, with its title and its caption.
 
-    png: the figure as a PNG image; empty until it is drawn.
+    name: name of its file without the ending. figure: a matplotlib figure. png: the figure as a PNG image; empty until
+    it is drawn.
     """
 
     name: str
@@ -56,10 +57,10 @@ class Illustration:
 
 @dataclass
 class Section:
-    """A part of the page, and of metrics.json under `key`.
+    """A section of the page. Its metrics are in metrics.json under the key `key`.
 
-    notices: sentences in coloured boxes. main: keys of the metrics that are shown beside the title. A `folded` section
-    shows only its title and main metrics until the reader opens it.
+    notices: sentences in coloured boxes. main: keys of the metrics that are shown beside the title. folded: whether
+    the section shows only its title and its main metrics until it is opened.
     """
 
     key: str
@@ -82,7 +83,7 @@ class Section:
 
     @property
     def columns(self) -> list[str]:
-        """Names of the columns of the table if all metrics hold several values; otherwise empty."""
+        """Names of the columns of the section's table if all metrics hold several values; otherwise empty."""
         if not all(isinstance(metric.value, dict) for metric in self.metrics):
             return []
         return list(dict.fromkeys(name for metric in self.metrics for name in metric.value))
@@ -90,10 +91,10 @@ class Section:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """The run of a page: its name, its title and the text of its scene.
+    """What the page shows of the run itself: its name, its title, the text of its scene, and more.
 
-    products: rows of a table, first a header, then one for each product. warnings: sentences on products that do not
-    fit together. links: title and relative path of other pages.
+    products: rows of a table; the first is the header, and each other row is on a product. warnings: sentences on
+    products that do not fit together. links: title and relative path of each page to which this one has a link.
     """
 
     name: str
@@ -125,12 +126,13 @@ def metrics_json(warnings: Sequence[str], sections: Sequence[Section]) -> str:
 
 
 def write_page(output: Path, run: RunRecord, sections: Sequence[Section], beside: Mapping[str, str]) -> None:
-    """Write index.html, metrics.json, figures/NAME.png and further texts; `beside` maps their file names to them.
+    """Write index.html, metrics.json, figures/NAME.png and further text files to the directory `output`.
 
-    If the directory has an earlier page, figures that the new page lacks are removed. Raises OSError or WriteError. If
-    a file cannot be written, no existing file is changed.
+    `beside` maps the names of the further files to their texts. If the directory has an earlier page, its figures that
+    the new page lacks are removed. Raises OSError or WriteError. If a file cannot be written, no existing file is
+    changed.
     """
-    earlier = (output / "metrics.json").exists()  # only then are other figures removed
+    earlier = (output / "metrics.json").exists()  # other figures are removed only beside an earlier page
     (output / "figures").mkdir(parents=True, exist_ok=True)
     figures = {output / "figures" / f"{each.name}.png": each.png
                for section in sections for each in section.illustrations if each.png}
@@ -150,8 +152,8 @@ def render_page(run: RunRecord, sections: Sequence[Section]) -> str:
 
 
 def _embedded(image: bytes) -> Markup:
-    """Return the attributes of an HTML image that holds a PNG file."""
-    # Bytes 16 to 19 are the width in pixels. A figure has 150 dots per inch and the page 96: with this factor letters
-    # have the same size in all figures.
+    """Return the attributes `width` and `src` of an HTML image. `src` holds the PNG file `image` itself."""
+    # Bytes 16 to 19 are the width in pixels. A figure has 150 dots per inch, and the page has 96. With this factor,
+    # letters have the same size in all figures.
     width = int.from_bytes(image[16:20], "big") * 96 // 150
     return Markup(f'width="{width}" src="data:image/png;base64,{base64.b64encode(image).decode()}"')

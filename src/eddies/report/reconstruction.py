@@ -19,9 +19,9 @@ def section(about: Mapping[str, float | str], errors: Mapping[str, np.ndarray], 
             plane: np.ndarray | None) -> Section:
     """Return the section on a product reconstruction.h5.
 
-    about: attributes of the product, such as the method. errors: columns over time, with the error at the tracks that a
-    second reconstruction leaves out. of_fields: columns over time with errors of the fields; empty if the true fields
-    are not known. plane: u_x [y, x] at z = pi in the last frame; None if the velocity is not stored.
+    about: attributes of the product, such as the method. errors: columns (frames,), among them the error at the tracks
+    that a second reconstruction leaves out. of_fields: columns (frames,) with the errors of the fields; empty if the
+    true fields are not known. plane: u_x [y, x] at z = pi in the last frame; None if the velocity is not stored.
     """
     both = {**{name: (of_fields["time"], of_fields[name]) for name in of_fields if name in ERRORS},
             **{name: (errors["time"], errors[name]) for name in errors if name in ERRORS}}
@@ -48,7 +48,10 @@ def section(about: Mapping[str, float | str], errors: Mapping[str, np.ndarray], 
 
 @styled
 def overview(errors: Mapping[str, tuple[np.ndarray, np.ndarray]], plane: np.ndarray | None) -> Figure:
-    """Draw errors over time and, if given, a plane of u_x. errors: times and values of each error, by key of ERRORS."""
+    """Draw errors over time and, if `plane` is given, a plane [y, x] of u_x.
+
+    errors: times and values of each error, by its key in ERRORS.
+    """
     figure, axes = panels(1, 1 if plane is None else 2, (4.4, 3.3), right=BAR)
     over_time = axes[0, 0]
     for name, (label, colour, style) in ERRORS.items():

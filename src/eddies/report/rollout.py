@@ -26,13 +26,13 @@ WITHOUT_KERNEL = "it needs velocity gradients from the smoothing kernel, and the
 
 
 def moved_by(attributes: Mapping[str, float | str]) -> str:
-    """Describe what moved the particles."""
+    """Return a description of what moved the particles, from the attributes of a rollout."""
     name = str(attributes["method"])
     return METHODS.get(name, name).format_map({"start": "flow", **attributes})  # older files have no start
 
 
 def section(run: Rollout, main: bool = True) -> Section:
-    """Return the section with the paper's Figs. 4 to 9, Lagrangian statistics and disorder.
+    """Return the section with the paper's Figs. 4 to 9, Lagrangian statistics, and the disorder of the particles.
 
     If `main` is false, as on the page of a variant, the section has fewer figures, but still all numbers.
     """
@@ -80,7 +80,10 @@ def section(run: Rollout, main: bool = True) -> Section:
 
 
 def _add_closure(shown: Section, solves: Mapping[str, np.ndarray]) -> None:
-    """Add numbers on solves for the resolved velocity. Means exclude the first frame: its solve has no start value."""
+    """Add numbers on the solves for the resolved velocity.
+
+    The mean leaves out the solve of the first frame, because it cannot start from the solution of an earlier solve.
+    """
     count, failed = solves["solves"][1:].sum(), int(solves["not_converged"].sum())
     shown.metrics += [
         Metric("closure_iterations", "iterations of a solve for the resolved velocity, mean",
@@ -136,7 +139,8 @@ def _add_planes(shown: Section, run: Rollout, main: bool) -> None:
 
 
 def _add_invariants(shown: Section, run: Rollout, main: bool) -> None:
-    """Add joint PDFs of the invariants Q and R at the last common time and, if `main`, the mean rates of Q and R."""
+    """Add joint PDFs of the invariants Q and R at the last common time and, if `main` is true, the mean rates of Q and
+    R."""
     statistics = against_truth.last_invariants(run)
     shown.metrics += [
         Metric("qr_kl", "KL divergence of the Q–R joint PDF", statistics.divergence),
@@ -198,7 +202,7 @@ def _add_particles(shown: Section, run: Rollout, main: bool) -> None:
 
 
 def _add_spectra(shown: Section, run: Rollout, main: bool) -> None:
-    """Add spectra; numbers are those at the last common time for which the flow's spectrum is stored."""
+    """Add spectra. Their numbers are those of the last common time at which the spectrum of the flow is stored."""
     cutoff, series = run.filter_wavenumber, [run.spectra_at(index) for index in run.shown_spectra(main)]
     last = series[-1]
     errors = {name: last.error(name, cutoff) for name in ("model", "truth")}
@@ -239,7 +243,10 @@ def _add_paths(shown: Section, run: Rollout, main: bool) -> None:
 
 
 def _add_disorder(shown: Section, run: Rollout, main: bool) -> None:
-    """Add nearest-neighbour distances at the last common time, and the variance of counts while the model is finite."""
+    """Add nearest-neighbour distances at the last common time and, over time, the variance of particle counts.
+
+    The time ends before the first frame of the model that is not finite.
+    """
     both = {"model": run.model, "truth": run.truth}
     position = run.pair(-1, "position")
     distances = {name: disorder.distance_probabilities(getattr(position, name), run.length) for name in both}

@@ -24,9 +24,9 @@ LINES = {"truth": {"label": "true tracers", "color": TRUTH},
 
 @styled
 def velocity_planes(rows: Mapping[str, Sequence[Plane]], times: Sequence[float]) -> Figure:
-    """Draw u_x in planes [y, x]. Each name has a row of panels, and each time (in turnovers) has a column.
+    """Draw u_x in planes [y, x], with a row of panels for each name in `rows` and a column for each time.
 
-    The planes of the first row determine the colour scale.
+    Times are in turnovers. The planes of the first row determine the colour scale.
     """
     high, wide = len(rows), len(times)
     figure, axes = panels(high, wide, ((2.3 * wide + 1.46) / wide, (2.1 * high + 1.15) / high), right=BAR, sharex=True,
@@ -46,9 +46,9 @@ def velocity_planes(rows: Mapping[str, Sequence[Plane]], times: Sequence[float])
 
 @styled
 def vorticity_and_energy(planes: Mapping[str, Plane]) -> Figure:
-    """Draw planes [y, x] of vorticity magnitude and kinetic energy, a column for each name.
+    """Draw planes [y, x] of the vorticity magnitude, and below them of the kinetic energy.
 
-    The first plane of a row determines its colour scale.
+    Each name in `planes` has a column of panels. The first plane of a row determines the colour scale of the row.
     """
     figure, axes = panels(2, len(planes), (2.6 + 2.1 / len(planes), 3.295), right=BAR, sharex=True, sharey=True)
     for row, quantity, label in zip(axes, (lambda plane: plane.vorticity, kinetic_energy),
@@ -66,16 +66,16 @@ def vorticity_and_energy(planes: Mapping[str, Plane]) -> Figure:
 
 
 def kinetic_energy(plane: Plane) -> np.ndarray:
-    """|u|^2 / 2 in a plane [y, x]."""
+    """Return |u|^2 / 2 in a plane, as an array [y, x]."""
     return np.sum(plane.velocity**2, axis=0) / 2
 
 
 @styled
 def errors_over_time(model: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray],
                      errors: Mapping[str, np.ndarray], turnover: float) -> Figure:
-    """Draw energy, velocity error and PDF divergences over time, and the density rms if model and truth have a density.
+    """Draw energy, velocity error and divergences of PDFs over time, and the density rms if both runs have a density.
 
-    model, truth: columns of `particle_series`. errors: columns of `error_series`.
+    model, truth: the results of `particle_series` for the two runs. errors: the result of `error_series`.
     """
     figure, axes = panels(2, 2, (4.6, 2.8))
     energy, error, divergence, density = axes.flat
@@ -109,9 +109,9 @@ def errors_over_time(model: Mapping[str, np.ndarray], truth: Mapping[str, np.nda
 
 @styled
 def particle_pdfs(pairs: Mapping[str, Sequence[Pair]], turnover: float) -> Figure:
-    """Draw the PDFs of velocity and acceleration, with all three components in one PDF.
+    """Draw the PDFs of velocity and acceleration. All three components count in one PDF.
 
-    pairs: for "velocity" and "acceleration", a Pair of arrays (n, 3) for each time.
+    pairs: for "velocity" and for "acceleration", a Pair of arrays (n, 3) at each time.
     """
     times = len(pairs["velocity"])
     if times > 1:
@@ -136,8 +136,8 @@ def energy_spectra(series: Sequence[SpectraAt], flow: Mapping[str, np.ndarray], 
                    filter_wavenumber: float) -> Figure:
     """Draw spectra of model and true tracers at several times, each with the DNS spectra of the nearest stored time.
 
-    `flow` is the table of DNS spectra, with the columns time (m,), wavenumber (k,), energy and filtered (m, k). Time 0
-    of `series` is the time `start_time` of this table.
+    `flow` is the table of DNS spectra, with the columns `time` (m,), `wavenumber` (shells,), `energy` and `filtered`,
+    each (m, shells). Time 0 of `series` is the time `start_time` of this table.
     """
     size = (3.5, 3.2) if len(series) > 1 else (5.6, 3.6)
     figure, axes = panels(1, len(series), size, foot=0.3, sharex=True, sharey=True)
@@ -165,7 +165,7 @@ def energy_spectra(series: Sequence[SpectraAt], flow: Mapping[str, np.ndarray], 
 
 @styled
 def path_statistics(model: PathStatistics, truth: PathStatistics, turnover: float) -> Figure:
-    """Draw statistics of velocity and acceleration along paths, dispersion of pairs, and size and shape of tetrads."""
+    """Draw statistics of velocity and acceleration along paths, pair dispersion, and the size and shape of tetrads."""
     figure, axes = panels(3, 3, (3.6, 2.6))
     (memory, structure, accelerations), (variance, flatness, pairs), (sizes, shapes, unused) = axes
     for run, name in ((truth, "truth"), (model, "model")):
@@ -232,14 +232,16 @@ def invariant_plane(statistics: InvariantStatistics,
                     flows: tuple[ConditionalVelocity, ConditionalVelocity] | None) -> Figure:
     """Draw joint PDFs of (R, Q) and, if `flows` of model and truth are given, the mean (dR/dt, dQ/dt) at each (R, Q).
 
-    An arrow has the direction of this mean as drawn. Its colour shows the magnitude of the mean in units of the axes.
+    The mean is drawn as an arrow, whose colour shows the magnitude. For the direction of the arrow, each rate is
+    divided by the range of its axis. For the magnitude, each rate is in its own unit, which is a power of <Q_w>.
     """
     names = "true tracers", "model"
     figure, axes = panels(1 if flows is None else 2, 2, (4.3, 3.2), right=BAR + 0.1, sharex=True, sharey=True)
     bins = statistics.bins
     across, up = bin_centres(bins.third)[-2], bin_centres(bins.second)[-2]
     densities = [bins.density(cells) for cells in (statistics.truth, statistics.model)]
-    # Two to eight contour levels, half a decade apart, from the peak of the truth down to the density of one particle.
+    # Two to eight contour levels, half a decade apart. The highest is just below the peak of the truth. If there are
+    # more than two, the lowest is above the density of one particle.
     peak, single = (np.log10(extreme) for extreme in (densities[0].max(), densities[0][densities[0] > 0].min()))
     top = np.floor(2 * peak)
     levels = 10.0 ** (np.arange(top, min(2 * single, top - 1.5), -1)[:8][::-1] / 2)
@@ -275,7 +277,10 @@ def invariant_plane(statistics: InvariantStatistics,
 
 
 def _draw_arrows(axis: Axes, flow: ConditionalVelocity, norm: LogNorm | None, third_limit: float, second_limit: float):
-    """Draw arrows of equal length where |R| < `third_limit` and |Q| < `second_limit`; no arrow leaves the panel."""
+    """Draw arrows of equal length at the cells with |R| < `third_limit` and |Q| < `second_limit`, and return them.
+
+    With these limits no arrow leaves the panel.
+    """
     third, second = np.meshgrid(bin_centres(flow.bins.third), bin_centres(flow.bins.second))
     inside = (np.abs(third) < third_limit) & (np.abs(second) < second_limit)
     second_rate, third_rate = (rate[inside] for rate in flow.mean(FEWEST))

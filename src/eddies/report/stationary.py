@@ -17,7 +17,7 @@ HISTORY = (("dissipation_rate", r"dissipation", TRUTH, "-"), ("injection_rate", 
 
 @styled
 def stationary_state(statistics: Mapping[str, np.ndarray], span: StationarySpan) -> Figure:
-    """Draw the energy balance and the energy of each component over turnovers, and the compensated mean spectrum.
+    """Draw the energy balance and the energy of each velocity component over turnovers, and the compensated spectrum.
 
     statistics: columns (samples,) of the whole run. span: its stationary part, over which the spectrum is averaged.
     """
@@ -46,7 +46,8 @@ def stationary_state(statistics: Mapping[str, np.ndarray], span: StationarySpan)
 def draw_compensated(axis: Axes, spans: Mapping[str | None, tuple[StationarySpan, str]]) -> None:
     """Draw the compensated mean spectrum of each span, and a band for Kolmogorov's constant.
 
-    spans: by label, a span and the colour of its curve. A curve with the label None is not in the legend.
+    spans: for each label in the legend, a span and the colour of its curve. A curve with the label None is not in the
+    legend.
     """
     for label, (span, colour) in spans.items():
         k_eta, compensated = span.compensated_spectrum()
@@ -60,7 +61,10 @@ def draw_compensated(axis: Axes, spans: Mapping[str | None, tuple[StationarySpan
 
 
 def section(statistics: Mapping[str, np.ndarray], span: StationarySpan) -> Section:
-    """Return the section: averages over the span and the literature's values at the same Re_lambda."""
+    """Return the section with averages over the span, and with values from the literature at the same Re_lambda.
+
+    statistics: columns (samples,) of the whole run.
+    """
     first, last = span.columns["time"][[0, -1]]
     shown = Section(
         "stationary", "Stationary turbulence",
@@ -76,7 +80,7 @@ def section(statistics: Mapping[str, np.ndarray], span: StationarySpan) -> Secti
 
 
 def columns_of(row: Row) -> dict[str, float | str]:
-    """Return the values of a row by the titles of their columns; missing values are left out."""
+    """Return the values of a row of the table, by the titles of the columns. Missing values are left out."""
     columns = {"this run": row.value, "standard error": row.error, "deviation": row.deviation,
                "literature": row.literature, "source": row.source}
     return {name: value for name, value in columns.items() if value not in (None, "")}

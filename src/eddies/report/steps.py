@@ -10,13 +10,14 @@ from eddies.report.page import Metric, Section
 
 NO_CHANGE = 1e-16  # drawn for a change of 0, which a logarithmic axis cannot show
 
-Trials = Mapping[str, Mapping[str, np.ndarray]]  # by integrator: columns (trials,); each trial halves the previous step
+# For each integrator, the columns (trials,) of its test rollouts. Each trial has half the step of the previous one.
+Trials = Mapping[str, Mapping[str, np.ndarray]]
 
 
 def section(found: Mapping[str, float | str], trials: Trials) -> Section:
     """Return the section with the chosen step, all trials and the cost of the search.
 
-    found: attributes of the chosen step and of the search, from the group `found` of step.h5.
+    found: attributes of the group `found` of step.h5, on the chosen step and on the search.
     """
     size = "Courant number" if found["integrator"] == "etdrk4" else "time step"
     metrics = [Metric(f"{name}_{step:.4g}", f"{name}, {size} {step:.4g}", {
@@ -38,9 +39,9 @@ def section(found: Mapping[str, float | str], trials: Trials) -> Section:
 
 @styled
 def convergence(found: Mapping[str, float | str], trials: Trials, size: str) -> Figure:
-    """Draw two panels: the change of the final velocities when a step is halved, and the error over the run time.
+    """Draw two panels: the change of the final velocities when the step is halved, and the error over the run time.
 
-    size: "time step" or "Courant number", written on the axis.
+    found: see `section`. size: the label of the axis of steps, "time step" or "Courant number".
     """
     figure, ((change, error),) = panels(1, 2, (4.6, 3.1), foot=0.3)
     for name, columns in trials.items():
@@ -54,7 +55,7 @@ def convergence(found: Mapping[str, float | str], trials: Trials, size: str) -> 
     change.set(title="Change by halving the step", xlabel=size, ylabel="rms change / rms velocity")
     error.set(title="Error over run time", xlabel="seconds per turnover", ylabel="rms error / rms velocity")
     plain_log_ticks(change.xaxis, error.xaxis, error.yaxis)
-    for axis in (change.xaxis, change.yaxis, error.xaxis, error.yaxis):  # leave room: trials may be close
+    for axis in (change.xaxis, change.yaxis, error.xaxis, error.yaxis):  # room: trials may be close to each other
         low, high = axis.get_data_interval()
         axis.set_view_interval(low / 2, high * 2, ignore=True)
     legend_at_foot(figure, change, 5)

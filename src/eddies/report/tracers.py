@@ -20,8 +20,9 @@ def section(found: TracerStatistics, scales: Mapping[str, float], power: float |
             filtered: bool = True) -> Section:
     """Return the section on the tracers.
 
-    scales: scales of the flow at the release of the tracers. power: forcing power per mass; None if it is unknown.
-    filtered: whether the tracers follow the filtered flow; otherwise they follow the whole flow.
+    scales: attributes of the group `reference` of ground_truth.h5, which hold at the release of the tracers. power:
+    power of the forcing per mass; None if it is unknown. filtered: whether the tracers follow the filtered flow;
+    otherwise they follow the whole flow.
     """
     kurtosis, (first, last) = found.kurtosis, found.energy_ratio[[0, -1]]
     metrics = [
@@ -64,8 +65,8 @@ def section(found: TracerStatistics, scales: Mapping[str, float], power: float |
 def tracers(found: TracerStatistics, scales: Mapping[str, float]) -> Figure:
     """Draw the ratio of tracer to field energy, the acceleration PDF, the structure function and the pair dispersion.
 
-    scales: attributes of the group `reference` of a ground truth, measured at the release of the tracers. Lags, and
-    times and lengths of pairs, are in Kolmogorov units, or in units of the large eddies if there is no viscosity.
+    scales: see `section`. Lags and the times and lengths of pairs are in Kolmogorov units or, without viscosity, in
+    units of the large eddies.
     """
     viscous = scales["viscosity"] > 0
     time_unit, time_name = (scales["kolmogorov_time"], r"t_\eta") if viscous else (scales["eddy_turnover_time"], "T")
@@ -113,6 +114,6 @@ def _energy_panel(axis: Axes, found: TracerStatistics, turnover: float) -> None:
 
 
 def _guide(axis: Axes, x: np.ndarray, law: np.ndarray, highest: float, label: str | None = None) -> None:
-    """Draw a law as a dashed line, where it is not above `highest`, the largest measured value."""
+    """Draw the values `law` over `x` as a dashed line, but only where they are at most `highest`."""
     below = law <= highest
     axis.loglog(x[below], law[below], color=DNS, linestyle="--", linewidth=1, label=label)

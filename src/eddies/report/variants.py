@@ -24,7 +24,7 @@ Row = Mapping[str, Any]
 
 KEY = "variants"
 MARKERS = list(zip((MODEL, TRUTH, SECOND, FOURTH, THIRD, DNS, FILTERED), "os^DvPX"))
-# Titles of the table columns to the right of the measures, by the key of the number in a row.
+# Titles of the columns of the table to the right of the measures, by the keys of their numbers in a row.
 COSTS = {"end": "end of the rollout (T)", "stopped_at": "became unstable at (T)", "wall_seconds": "wall seconds per T",
          "wall_seconds_low": "wall seconds, lower quartile", "wall_seconds_high": "wall seconds, upper quartile",
          "core_seconds": "core seconds per T", "seconds_per_step": "seconds per step", "time_step": "time step",
@@ -45,7 +45,7 @@ CAPTION = ("In the table, spectrum errors, energies and KL divergences (nats) ar
 class ErrorAgainstTime:
     """The errors and run times of all variants.
 
-    rows: the numbers of each variant by key; a missing number is None. subject: name of the variant with which the
+    rows: for each variant, its numbers by key; a missing number is None. subject: name of the variant with which the
     others are compared.
     """
 
@@ -54,9 +54,9 @@ class ErrorAgainstTime:
 
     @property
     def drawn(self) -> list[str]:
-        """The measures of DRAWN that at least one stable variant with a run time has.
+        """Measures of DRAWN that are known for at least one variant that is stable and has a run time.
 
-        If no rollout reaches T/2, the velocity error at the end replaces the one at T/2.
+        If no such variant reaches T/2, the velocity error at the end replaces the one at T/2.
         """
         replaced = {} if self.finished("velocity_error_half") else {"velocity_error_half": "velocity_error_end"}
         return [name for name in (replaced.get(name, name) for name in DRAWN) if self.finished(name)]
@@ -71,7 +71,7 @@ class ErrorAgainstTime:
     def summary(self) -> list[str]:
         """Sentences on where the subject is worth its cost, and on the cheapest grid that is at least as accurate.
 
-        A variant that became unstable is treated as one without numbers.
+        A variant that became unstable counts as one without numbers.
         """
         numbers = [row if is_stable(row) else {**row, **dict.fromkeys(self.drawn)} for row in self.rows]
         subject = next(row for row in numbers if row["name"] == self.subject)
@@ -86,21 +86,21 @@ class ErrorAgainstTime:
         return [sentence for sentence in sentences if sentence]
 
     def finished(self, measure: str) -> list[Row]:
-        """Rows of stable variants that have this measure and a run time."""
+        """Return the rows of stable variants that have this measure and a run time."""
         return [row for row in self.rows if is_stable(row) and None not in (row[measure], row[COST])]
 
     def stopped(self) -> list[Row]:
-        """Rows of variants that became unstable and have a run time."""
+        """Return the rows of variants that became unstable and have a run time."""
         return [row for row in self.rows if not is_stable(row) and row[COST] is not None]
 
 
 def is_stable(row: Row) -> bool:
-    """Return whether the rollout reached its end."""
+    """Return whether the rollout of a variant reached its end."""
     return row["status"] == "complete"
 
 
 def section(table: ErrorAgainstTime, notes: Sequence[str] = ()) -> Section:
-    """Return the section: summary, notes on the numbers, the figure, and the table of errors and costs."""
+    """Return the section with a summary, `notes` on the numbers, the figure, and the table of errors and costs."""
     columns = {key: MEASURES[key] for key in SHOWN if any(row[key] is not None for row in table.rows)} | COSTS
     metrics = [Metric(row["name"], row["label"], {title: _with_spread(row, key) for key, title in columns.items()})
                for row in table.rows]
@@ -118,9 +118,9 @@ def _notice(row: Row) -> str:
 
 
 def _with_spread(row: Row, column: str) -> Any:
-    """Return a number of a row, with its standard deviation over realisations if known.
+    """Return the number of a row in a column, with its standard deviation over realisations if this is known.
 
-    If the file of a trained model lacks the cost of its training, this cost is "not stored".
+    If the file of a trained model lacks the cost of its training, return "not stored" for this cost.
     """
     if column in ("training_seconds", "training_steps") and row[column] is None and row["weights"] is not None:
         return "not stored"
@@ -180,12 +180,15 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
 
 
 def in_symbols(words: str) -> str:
-    """Write the symbols in a text as formulas."""
+    """Return a text in which the symbols t_η and k_d are written as formulas."""
     return words.replace("t_η", r"$t_\eta$").replace("k_d", "$k_d$")
 
 
 def _set_limits(axis: Axes, costs: Sequence[float], errors: Sequence[float]) -> None:
-    """Set limits with room for names and, at the top, for unstable variants; label ticks with plain numbers."""
+    """Set the limits of both axes, and label their ticks with plain numbers.
+
+    The limits leave room for names and, at the top, for unstable variants.
+    """
     for values, limit, room, part in ((costs, axis.set_xlim, (0.16, 0.16), axis.xaxis),
                                       (errors, axis.set_ylim, (0.12, 0.2), axis.yaxis)):
         lowest, highest = (min(values), max(values)) if values else (0.1, 1.0)
@@ -195,7 +198,7 @@ def _set_limits(axis: Axes, costs: Sequence[float], errors: Sequence[float]) -> 
 
 
 def _top(axis: Axes) -> float:
-    """Return the y value at which unstable variants are drawn, a little below the upper edge."""
+    """Return the y value at which unstable variants are drawn: a little below the upper edge of the panel."""
     low, high = np.log10(axis.get_ylim())
     return 10 ** (high - 0.03 * (high - low))
 
@@ -203,8 +206,8 @@ def _top(axis: Axes) -> float:
 def name_points(axis: Axes, points: np.ndarray, names: Sequence[str], bold: Sequence[bool]) -> list[Bbox]:
     """Write a name beside each of the points (n, 2) of a panel with fixed limits. Return the names' boxes in pixels.
 
-    Each name takes the nearest height, to the right or left of its point, at which it covers no other name or point. A
-    thin line connects a distant name with its point. Empty names are not written.
+    A name is to the right or left of its point, at the nearest height at which it covers no other name or point. A thin
+    line connects a distant name with its point. Empty names are not written. bold: for each name, whether it is bold.
     """
     renderer, reach, frame = axis.figure.canvas.get_renderer(), 5 * axis.figure.dpi / 72, axis.bbox
     taken = [Bbox([pixel - reach, pixel + reach]) for pixel in axis.transData.transform(points)]

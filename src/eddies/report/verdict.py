@@ -1,8 +1,8 @@
 """The verdict of a report: it marks each main number as good, fair or poor.
 
-Two limits, the largest good error and the largest fair error, hold for all methods alike. Each is a fixed number or a
-multiple of the error of a baseline. If samples of the truth have an error themselves, each limit is at least a multiple
-of that error.
+Two limits, the largest good error and the largest fair error, are the same for all methods. A limit is a fixed number
+or a multiple of the error of a baseline. Some errors are not zero even for samples of the truth. The limits of such an
+error are at least a multiple of the value for the truth.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +13,7 @@ from eddies.report.page import Metric, Section
 
 GOOD, FAIR, POOR = "good", "fair", "poor"
 KEY = "verdict"
-#: Order of the sections on the page, and the sections that are not folded.
+#: Keys of the sections in the order of the page (ORDER), and those of the sections that are not folded (OPEN).
 ORDER = ("variants", KEY, "rollout", "forced", "step", "model", "reconstruction", "kernel", "cost", "ground_truth",
          "stationary", "tracers")
 OPEN = ("variants", KEY, "rollout", "forced")
@@ -23,7 +23,7 @@ BESIDE_NO_FORCE = BESIDE_GRADIENT = (0.2, 0.5)  # times the error of the baselin
 BESIDE_TEXTBOOK = (0.95, 1.05)  # times the error of the better kernel that needs no training
 ENERGY = (0.03, 0.1)            # relative deviation from the truth
 SPECTRUM = (0.05, 0.2)          # rms of ln(E/E_filtered)
-DIVERGENCE = (0.002, 0.02)      # nats; normal PDFs whose standard deviations differ by 4 % and 14 % have these values
+DIVERGENCE = (0.002, 0.02)      # nats; values of two normal PDFs whose standard deviations differ by 4 % and by 14 %
 FLOORS = (2.0, 5.0)             # times the error of samples of the truth itself
 LEAST_BASELINE = 0.1            # velocities are judged if their error without any force is at least this
 KERNEL_WORDS = {GOOD: "better than", FAIR: "about as good as", POOR: "worse than"}
@@ -35,8 +35,8 @@ class Judged:
     """A number of the report and its mark: good, fair or poor.
 
     `error` is compared with `good` and `fair`, the largest errors with these marks. `within` is the format of these two
-    in the table. `words` is the name of the number in the table, and `short` its name in sentences. `baseline_text`
-    describes the baseline. If `judged` is false, the number gets no mark.
+    limits in the table. `words` is the name of the number in the table, and `short` its name in sentences.
+    `baseline_text` describes the baseline. If `judged` is false, the number gets no mark.
     """
 
     key: str
@@ -52,7 +52,7 @@ class Judged:
 
     @property
     def mark(self) -> str:
-        """good, fair, poor, or "not judged"."""
+        """Mark of the number: "good", "fair", "poor", or "not judged"."""
         if not self.judged:
             return "not judged"
         return GOOD if self.error <= self.good else FAIR if self.error <= self.fair else POOR
@@ -68,7 +68,7 @@ class Judged:
 def arranged(sections: Sequence[Section], warned: bool) -> list[Section]:
     """Return the sections in the order of the page, with a verdict if there is something to judge.
 
-    warned: whether the report warns that products do not fit together.
+    The sections that are not in OPEN are folded. warned: whether the report warns that products do not fit together.
     """
     found = {each.key: each for each in sections}
     judgement = [section(found, warned)] if found.keys() & {"rollout", "model", "kernel"} else []
@@ -79,7 +79,10 @@ def arranged(sections: Sequence[Section], warned: bool) -> list[Section]:
 
 
 def section(sections: Mapping[str, Section], warned: bool) -> Section:
-    """Return the verdict on a run from the numbers in `sections`, the other sections of its page by key."""
+    """Return the section with the verdict on a run. `sections` are the other sections of the page by key.
+
+    warned: whether the report warns that products do not fit together.
+    """
     numbers = {key: {metric.key: metric.value for metric in each.metrics} for key, each in sections.items()}
     rollout, model, kernel = (numbers.get(key, {}) for key in ("rollout", "model", "kernel"))
     of_rollout, of_model, of_kernel = [*_rollout(rollout)], [*_model(model)], [*_kernel(kernel)]
@@ -96,7 +99,7 @@ def section(sections: Mapping[str, Section], warned: bool) -> Section:
 
 
 def _sentences(numbers: Mapping[str, Any], judged: Sequence[Judged]) -> Iterator[str]:
-    """Yield sentences on the rollout."""
+    """Yield sentences on the rollout. `numbers` are the values of its metrics, and `judged` their marks."""
     if not numbers:
         yield "There is no rollout to judge."
         return
