@@ -15,9 +15,9 @@ EVERY = 8  # steps between two measurements of the speed
 class CourantLimit:
     """Time step with  step * (max(|u| + |v| + |w|) + sqrt(3) c) <= courant * dx.
 
-    Steps are taken from the ladder largest * 2^-m. `sound_speed` is c for a stepper that treats sound explicitly, and 0
-    for others. The factor sqrt(3) belongs to sound that travels along the diagonal. The flow speed is measured every
-    EVERY steps.
+    The step is the largest of largest * 2^-m, m = 0, 1, ..., that satisfies this. `sound_speed` is c for a stepper that
+    treats sound explicitly, and 0 for others. The factor sqrt(3) belongs to sound that travels along the diagonal of a
+    cell. The speed of the flow is measured every EVERY steps.
     """
 
     def __init__(self, grid: SpectralGrid, courant: float, largest: float, sound_speed: float = 0.0) -> None:
@@ -25,7 +25,7 @@ class CourantLimit:
         self._bound = 0.0
 
     def __call__(self, state: np.ndarray, clock: Clock) -> float:
-        """Return the next step; the last one is shortened to end at the clock's end."""
+        """Return the next step; the last step is shortened to end at the clock's end. Collective."""
         if clock.steps % EVERY == 0 or self._bound == 0.0:
             self._bound = self.bound(state, clock)
         return min(ladder_step(self.largest, self._bound), clock.remaining)
@@ -51,7 +51,8 @@ class FixedStep:
         self.step = step
 
     def __call__(self, state: np.ndarray, clock: Clock) -> float:
-        # A remainder that differs from the step by round-off is a full step: another size would need new operators.
+        # A remaining time that differs from the step by round-off is a full step, because another step size would need
+        # new operators f(step L).
         return self.step if clock.remaining > self.step * (1 - 1e-6) else clock.remaining
 
     def state_dict(self) -> dict[str, float]:

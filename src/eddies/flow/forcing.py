@@ -14,13 +14,13 @@ SILENT = {"float64": 1e-20, "float32": 1e-10}
 class LinearForcing:
     """Force f(k) = A u_s(k) for 0 < |k| < `wavenumber`, with A = P / sum |u_s|^2, so that <u.f> = P = `injection_rate`.
 
-    u_s is the solenoidal part of the velocity. This is the form of Lundgren (2003) and of Petersen and Livescu (2010);
+    u_s is the solenoidal part of the velocity. This is the form of Lundgren (2003) and of Petersen and Livescu (2010).
     A is computed at every evaluation. If the velocity has passed a Gaussian filter of `filter_width`, the sum uses the
     unfiltered modes, and f is the filtered force of the unfiltered flow.
 
-    All ranks hold the few forced modes; one reduction collects them. In the plane kx = 0 mirror modes are made
-    conjugate. Otherwise the forcing would amplify a part that no real field has. The first evaluation raises
-    UserError if the velocity has no energy at the forced modes.
+    All ranks hold the few forced modes; one reduction collects them. In the plane kx = 0, the modes k and -k are both
+    stored, and they are made conjugate. Otherwise the forcing would amplify round-off errors. The first evaluation
+    raises UserError if the velocity has no energy at the forced modes.
     """
 
     def __init__(self, grid: SpectralGrid, injection_rate: float, wavenumber: float,
@@ -53,7 +53,7 @@ class LinearForcing:
         tendency[self._own] += force[:, :, self._block_rows, :].astype(tendency.dtype)
 
     def _require_energy(self, forced: float, velocity: np.ndarray) -> None:
-        # Once is enough: forced modes do not lose all their energy, and the sum costs a message.
+        # One check is enough, because forced modes do not lose all their energy. The sum costs a message.
         total = self.grid.sum_modes((np.abs(velocity) ** 2).sum(axis=0))
         if forced <= SILENT[self.grid.precision] * total:
             raise UserError("[forcing]: the flow has no energy at 0 < |k| < wavenumber = "

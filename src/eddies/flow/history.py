@@ -1,4 +1,4 @@
-"""Time series of a flow's statistics, and its energy budget."""
+"""Time series of the statistics of a flow, and the flow's energy budget."""
 
 import time
 from collections.abc import Mapping
@@ -19,10 +19,11 @@ EVERY = 4  # steps between two samples
 
 
 class FlowHistory:
-    """Observer that measures a flow every few steps: `rows` has one entry per sample, `spectra` the E(k) of each.
+    """Observer that measures a flow every few steps: for each sample `rows` has a dict and `spectra` a spectrum E(k).
 
-    It also integrates the energy budget. `budget_error` is |E(t) - E(0) - integral of (injection - dissipation)|
-    divided by the dissipated energy, or by E(0) where nothing is dissipated.
+    It also integrates the energy budget of the total energy e(t). `budget_error` is
+    |e(t) - e(0) - integral of (injection - dissipation)| divided by the dissipated energy, or by e(0) if no energy is
+    dissipated.
     """
 
     def __init__(self, fluid: Fluid, every: int = EVERY) -> None:
@@ -38,9 +39,10 @@ class FlowHistory:
             self.sample(state, clock)
 
     def sample(self, state: np.ndarray, clock: Clock) -> dict[str, float]:
-        """Return the row of this step. It is measured and stored unless the last row already belongs to this step.
+        """Measure the flow, store the sample and return its row; collective.
 
-        Raises FlowDiverged if the flow is not finite.
+        If the last row already belongs to this step, only return that row. Raises FlowDiverged if the flow is not
+        finite.
         """
         if self.rows and clock.steps == self._steps:
             return self.rows[-1]
@@ -75,7 +77,7 @@ class FlowHistory:
         return {name: np.array([row[name] for row in self.rows]) for name in self.rows[0]}
 
     def state_dict(self) -> dict[str, Any]:
-        """Return rows, spectra and the integrals of the budget, for a checkpoint."""
+        """Return the rows, the spectra and the integrals of the energy budget, for a checkpoint."""
         columns = self.columns()
         return {"history": {"injected": self._injected, "dissipated": self._dissipated, "steps": self._steps,
                             "columns": list(columns)},

@@ -9,8 +9,9 @@ from eddies.spectral.spectral_grid import SpectralGrid
 def random_velocity(grid: SpectralGrid, seed: int, amplitude: float, peak_wavenumber: float) -> np.ndarray:
     """Return a Gaussian solenoidal velocity (3, kz, ky, kx) with the spectrum E(k) ~ k^4 exp(-2 (k / k_p)^2).
 
-    `amplitude` is the rms of one component. Random numbers are keyed by (seed, ky, kz) and drawn along kx, so the field
-    depends neither on the number of ranks nor on the resolution. Every shell has exactly the energy of this spectrum.
+    k_p is `peak_wavenumber`, and `amplitude` is the rms of one component. Every shell of modes has exactly the energy
+    of this spectrum. Each line of modes along kx has its own generator, seeded by (seed, ky, kz), so that the field
+    depends neither on the number of ranks nor on the resolution.
     """
     velocity, energy = _gaussian_solenoidal(grid, seed)
     k = np.arange(len(energy))
@@ -19,10 +20,10 @@ def random_velocity(grid: SpectralGrid, seed: int, amplitude: float, peak_wavenu
 
 
 def velocity_of_spectrum(grid: SpectralGrid, seed: int, wavenumber: np.ndarray, energy: np.ndarray) -> np.ndarray:
-    """Return a Gaussian solenoidal velocity (3, kz, ky, kx) with the spectrum `energy` at ascending wavenumbers.
+    """Return a Gaussian solenoidal velocity (3, kz, ky, kx) with a given spectrum E(k).
 
-    ln E is linear in ln k between the given wavenumbers, and E is zero outside their range. Random numbers are those of
-    `random_velocity`.
+    E has the values `energy` at the ascending values `wavenumber`. ln E is linear in ln k between them, and E is zero
+    outside their range. The random numbers are those of `random_velocity`.
     """
     velocity, present = _gaussian_solenoidal(grid, seed)
     given = energy > 0
@@ -32,7 +33,7 @@ def velocity_of_spectrum(grid: SpectralGrid, seed: int, wavenumber: np.ndarray, 
 
 
 def _gaussian_solenoidal(grid: SpectralGrid, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a solenoidal velocity with normally distributed modes and zero mean, and its spectrum."""
+    """Return normally distributed modes of a solenoidal velocity with zero mean, and the spectrum of this velocity."""
     velocity = grid.solenoidal(_gaussian_modes(grid, seed))
     velocity[:, grid.index_squared == 0] = 0
     return velocity, energy_spectrum(grid, velocity)
@@ -45,7 +46,7 @@ def _with_spectrum(grid: SpectralGrid, velocity: np.ndarray, energy: np.ndarray,
 
 
 def _gaussian_modes(grid: SpectralGrid, seed: int) -> np.ndarray:
-    """Return complex normal numbers (3, kz, ky, kx); those of mirror modes k and -k are conjugate."""
+    """Return normally distributed complex numbers (3, kz, ky, kx); those of the modes k and -k are conjugate."""
     def line(ky: int, kz: int) -> np.ndarray:
         # Negative wavenumbers are folded to odd numbers, because seeds must not be negative.
         fold = [2 * k if k >= 0 else -2 * k - 1 for k in (ky, kz)]
@@ -73,7 +74,7 @@ def taylor_green(grid: SpectralGrid, amplitude: float) -> np.ndarray:
 
 
 def abc(grid: SpectralGrid, amplitude: float, wavenumber: int) -> np.ndarray:
-    """Return the Arnold-Beltrami-Childress flow with A = B = C = amplitude.
+    """Return the Arnold-Beltrami-Childress flow with A = B = C = amplitude and the wavenumber k.
 
     Its vorticity is k times its velocity, so that the flow decays as exp(-nu k^2 t).
     """
@@ -88,20 +89,20 @@ def shear_wave(grid: SpectralGrid, amplitude: float, wavenumber: int) -> np.ndar
 
 
 def sound_wave_density(grid: SpectralGrid, amplitude: float, wavenumber: int) -> np.ndarray:
-    """Return ln(rho / rho_0) = amplitude cos(k x) of a standing sound wave that starts at rest; (kz, ky, kx)."""
+    """Return the modes (kz, ky, kx) of ln(rho / rho_0) = amplitude cos(k x), a standing sound wave from rest."""
     x, _, _ = grid.coordinates()
     return _modes(grid, amplitude, [np.cos(wavenumber * x)])[0]
 
 
 def balanced_density(grid: SpectralGrid, velocity: np.ndarray, sound_speed: float) -> np.ndarray:
-    """Return s = p / c^2 (kz, ky, kx) with the incompressible pressure p.
+    """Return the modes (kz, ky, kx) of s = p / c^2, where p is the pressure of the incompressible flow.
 
-    A flow with this initial s emits almost no sound.
+    A flow with this initial s = ln(rho / rho_0) emits almost no sound.
     """
     return grid.pressure_of(grid.squares(velocity)) / sound_speed**2
 
 
-#: Functions that return the initial velocity, by the key `kind` of [initial]. Arguments: grid, section [initial], seed.
+#: Functions that return the initial velocity, by [initial] kind. Their arguments are grid, section [initial] and seed.
 INITIAL_FLOWS = {
     "random": lambda grid, initial, seed: random_velocity(grid, seed, initial.amplitude, initial.peak_wavenumber),
     "taylor-green": lambda grid, initial, seed: taylor_green(grid, initial.amplitude),

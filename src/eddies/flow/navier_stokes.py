@@ -13,18 +13,20 @@ from eddies.time_stepping import ScalarFunction, divided_difference
 
 
 class Fluid:
-    """Equations of a flow. A fluid of your own is built with the same arguments; derive it from one of the two below.
+    """Equations of a flow. A fluid of your own takes the same arguments; derive it from one of the two classes below.
 
     Parameters
     ----------
     grid : grid of the flow.
     viscosity : kinematic viscosity nu.
     sound_speed : c; infinite for an incompressible fluid.
-    forcing : adds a force to the velocity's tendency. It ends at the release of tracers unless [tracers] forced = true.
-    closure : force of the scales that a coarse grid or a filter leaves out.
+    forcing : adds a force to the tendency du/dt of the velocity. The force ends when tracers are released, unless
+        [tracers] forced = true.
+    closure : adds the force of the scales that a coarse grid or a filter removes.
 
-    The state is held as modes. If `compressible`, it is (u, v, w, s) with s = ln(rho / rho_0), (4, kz, ky, kx);
-    otherwise it is the velocity, (3, kz, ky, kx). `transforms` counts the Fourier transforms of one evaluation of N.
+    A state is an array of modes. If `compressible`, it holds (u, v, w, s) with s = ln(rho / rho_0), (4, kz, ky, kx);
+    otherwise it holds the velocity, (3, kz, ky, kx). `transforms` is the number of Fourier transforms in one evaluation
+    of the nonlinear terms N.
     """
 
     compressible: bool
@@ -37,9 +39,10 @@ class Fluid:
 
 
 class IncompressibleFluid(Fluid):
-    """u_t = P[u x omega + f] + nu laplacian u,  P the projection on solenoidal fields, which absorbs p + |u|^2 / 2.
+    """The incompressible fluid, u_t = P[u x omega + f] + nu laplacian u, with the vorticity omega and a force f.
 
-    The force of a closure is projected as well. An evaluation takes nine transforms; ranks exchange data for eight.
+    P is the projection on solenoidal fields, which removes the gradient of p + |u|^2 / 2. The force of a closure is
+    projected as well. An evaluation of N takes nine transforms. Ranks exchange data for only eight of them.
     """
 
     compressible, transforms = False, 9
@@ -64,7 +67,7 @@ class IncompressibleFluid(Fluid):
         return -self.viscosity * self.grid.wavenumber_squared * state
 
     def linear_function(self, function: ScalarFunction, step: float) -> np.ndarray:
-        """Return f(step L): the factor f(-nu k^2 step) of each mode with kz >= 0, of shape (kz, ky, 1, kx)."""
+        """Return f(step L) with f = `function`: a factor f(-nu k^2 step) of each mode with kz >= 0, (kz, ky, 1, kx)."""
         return functions_of_wavenumber(self.grid, lambda k2: [function(-self.viscosity * k2 * step).real])
 
     def combine(self, *terms: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
@@ -72,14 +75,15 @@ class IncompressibleFluid(Fluid):
 
 
 class CompressibleFluid(Fluid):
-    """The barotropic fluid p = c^2 rho with constant kinematic viscosity, in s = ln(rho / rho_0):
+    """The fluid with p = c^2 rho and constant kinematic viscosity. Its equations for u and s = ln(rho / rho_0) are
 
         s_t = -div u - u.grad s
         u_t = -c^2 grad s + nu (laplacian u + 1/3 grad div u) - u.grad u + 2 nu (S - 1/3 div u).grad s + f
 
-    S is the rate of strain. All nonlinear terms but a closure's force are quadratic, so the 2/3 rule dealiases them
-    exactly. An evaluation takes fifteen backward transforms (u and the gradients of u and s) and four forward ones.
-    Ranks exchange data for only eight backward transforms: derivatives along x and y follow the transform along z.
+    S is the rate of strain and f a force. All nonlinear terms except the force of a closure are quadratic, so that they
+    have no aliasing errors under the 2/3 rule. An evaluation of N takes fifteen backward transforms (u and the
+    gradients of u and s) and four forward ones. Ranks exchange data for only eight of the backward ones, because
+    derivatives along x and y are formed after that exchange.
     """
 
     compressible, transforms = True, 19
@@ -101,7 +105,7 @@ class CompressibleFluid(Fluid):
         self._formulas.advection(fields, self.viscosity, out)
 
     def linear(self, state: np.ndarray) -> np.ndarray:
-        """Return -c^2 grad s - nu (k^2 u + 1/3 k (k.u)), and -div u."""
+        """Return the linear terms L u: the modes of -c^2 grad s - nu (k^2 u + 1/3 k (k.u)), then of -div u."""
         grid, nu = self.grid, self.viscosity
         velocity, s = state[:3], state[3]
         longitudinal = grid.along_wavevector(velocity)
@@ -113,13 +117,15 @@ class CompressibleFluid(Fluid):
         return result
 
     def linear_function(self, function: ScalarFunction, step: float) -> np.ndarray:
-        """Return f(step L): five real factors of each mode with kz >= 0, of shape (kz, ky, 5, kx), in this order:
+        """Return f(step L) with f = `function`: five real factors of each mode with kz >= 0, (kz, ky, 5, kx).
+
+        In this order they are transverse, excess, elastic, identity and coupling. They map a state (u, s) to (u', s'):
 
             u' = transverse u + k (excess k.u + elastic sigma),   sigma' = identity sigma - coupling k.u,   sigma = -i s
 
-        L acts on the transverse velocity as -nu k^2, and on (s, longitudinal u) as the block
+        L acts on the transverse velocity as -nu k^2, and on s and the longitudinal velocity as the matrix
         [[0, -ik], [-i c^2 k, -2 gamma]], gamma = 2/3 nu k^2, with the eigenvalues -gamma +- sqrt(gamma^2 - c^2 k^2).
-        With M = step * block, its eigenvalues z1 and z2, and the divided difference f[z1, z2], the function is
+        Let M be step times this matrix, z1 and z2 its eigenvalues, and f[z1, z2] the divided difference. Then
         f(M) = f[z1, z2] M + (f(z1) - z1 f[z1, z2]) I.
         """
         nu, c = self.viscosity, self.sound_speed
@@ -142,14 +148,17 @@ class CompressibleFluid(Fluid):
 
 
 def advective_speed(grid: SpectralGrid, velocity: np.ndarray) -> float:
-    """Return the largest |u| + |v| + |w| on this rank's grid points: the speed of the advective Courant number."""
+    """Return the largest |u| + |v| + |w| at this rank's grid points, the speed in the advective Courant number.
+
+    `velocity` holds modes. Collective.
+    """
     return float(np.max([np.abs(u).sum(axis=0).max() for u in grid.blocks(velocity, fields=3)], initial=0.0))
 
 
 def functions_of_wavenumber(grid: SpectralGrid, functions: Callable[[np.ndarray], list[np.ndarray]]) -> np.ndarray:
     """Return n real functions of k^2 at the modes with kz >= 0, (kz, ky, n, kx); modes with -kz have the same values.
 
-    `functions` is called once, with the distinct values of k^2.
+    `functions` is called once, with the distinct values of k^2, and returns the list of the values of each function.
     """
     unit = 2 * np.pi / grid.decomposition.length
     index_squared = grid.index_squared[: grid.cutoff + 1]

@@ -1,4 +1,4 @@
-"""Theoretical limits of the time step, and a watch that ends an unstable run and names the limit it broke."""
+"""Theoretical limits of the time step, and a check that ends an unstable run and names the limits it exceeded."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -13,11 +13,11 @@ from eddies.flow.navier_stokes import Fluid, advective_speed
 from eddies.parallel.reduction import global_max, global_sum
 from eddies.time_stepping import RungeKutta4
 
-# Where the imaginary and the negative real axis leave the stability region |1 + z + z^2/2 + z^3/6 + z^4/24| <= 1 of
-# the four-stage fourth-order Runge-Kutta method.
+# Largest |z| on the imaginary and on the negative real axis in the stability region of the classical fourth-order
+# Runge-Kutta method, |1 + z + z^2/2 + z^3/6 + z^4/24| <= 1.
 IMAGINARY_REACH, REAL_REACH = math.sqrt(8), 2.785293563405282
 
-# Above this advective number undamped sound grows by more than 0.1 % a step with ETDRK4: see `limits_of_step`.
+# Above this advective number, undamped sound waves grow by more than 0.1 % per step of ETDRK4: see `limits_of_step`.
 LEAK = 0.5
 
 # A flow is unstable when its energy exceeds the available energy by this factor. The factor is generous: with strong
@@ -30,7 +30,7 @@ REMEDIES = {"advection": "lower courant or step", "sound": "lower courant or ste
 
 
 class FlowDiverged(UserError, RuntimeError):
-    """The flow is not finite, or its energy grows without a source."""
+    """The flow is not finite, or its energy grows far beyond the available energy."""
 
     def __init__(self, seen: str, clock: Clock, advice: str) -> None:
         super().__init__(f"unstable at step {clock.steps}, time {clock.time:.6g}: {seen}. {advice}")
@@ -45,7 +45,10 @@ class FlowDiverged(UserError, RuntimeError):
 
 @dataclass(frozen=True)
 class StepLimit:
-    """A stability limit: a number that grows with the time step, and the boundary up to which the step is stable."""
+    """A stability limit: the step is stable if `number`, which grows with the step, does not exceed `boundary`.
+
+    `name` is a key of REMEDIES, and `expression` is the formula of the number as text.
+    """
 
     name: str
     expression: str
@@ -61,7 +64,7 @@ class StepLimit:
 
 
 def step_limits(fluid: Fluid, stepper: Callable, step: float, speed: float) -> list[StepLimit]:
-    """Return the limits of a step of a fluid in a flow with the largest |u| + |v| + |w| = `speed`."""
+    """Return the stability limits of a time step of a fluid; `speed` is the largest |u| + |v| + |w| in the flow."""
     grid = fluid.grid
     return limits_of_step(2 * math.pi / grid.decomposition.length * grid.cutoff, step, speed, fluid.viscosity,
                           isinstance(stepper, RungeKutta4), fluid.sound_speed if fluid.compressible else None)
@@ -69,19 +72,21 @@ def step_limits(fluid: Fluid, stepper: Callable, step: float, speed: float) -> l
 
 def limits_of_step(k_max: float, step: float, speed: float, viscosity: float, explicit: bool,
                    sound_speed: float | None) -> list[StepLimit]:
-    """Return the limits of a step; `explicit` means RK4 instead of ETDRK4, `sound_speed` is None without sound.
+    """Return the stability limits of a time step `step` of RK4 if `explicit`, else of ETDRK4.
 
-    k_max is the cutoff of each axis. The eigenvalues of the largest modulus belong to |k| = sqrt(3) k_max. They are
-    i k_max (|u| + |v| + |w|) for advection, with i sqrt(3) k_max c added for sound. For viscosity they are
-    -3 nu k_max^2, or -4 nu k_max^2 in a compressible fluid. The limits of RK4 are where its stability region ends on
-    the axes.
+    `speed` is the largest |u| + |v| + |w|, `k_max` the largest wavenumber along each axis, nu the viscosity and c the
+    `sound_speed`, which is None without sound. The advective number is step k_max speed. The eigenvalues of the largest
+    modulus belong to |k| = sqrt(3) k_max. They are i k_max (|u| + |v| + |w|) for advection, with i sqrt(3) k_max c
+    added for sound. For viscosity they are -3 nu k_max^2, or -4 nu k_max^2 in a compressible fluid. The limits of RK4
+    are where its stability region ends on the axes.
 
     ETDRK4 treats viscosity and sound exactly. Without them its stability region is that of RK4. Viscosity raises the
     largest stable advective number to 3.2, 3.9 and 4.9 at nu k^2 step = 1, 3 and 5, and to about 0.7 nu k^2 step at
-    larger values. Undamped sound waves with c k step between 1 and 7 grow even inside the stability region. In a
-    uniform flow they grow by up to 0.1, 2, 7 and 15 % per step at an advective number of 0.5, 1, 1.5 and 2. A damping
-    2/3 nu k^2 step of 0.0013, 0.024, 0.1 and 0.22 stops this growth. In turbulence few points move at the largest
-    speed: 60 steps at three times the limit did not raise the energy tenfold (12^3 cells, M_t from 0.01 to 0.5).
+    larger values. Undamped sound waves with c k step between 1 and 7 grow even below the advective limit. In a uniform
+    flow they grow by up to 0.1, 2, 7 and 15 % per step at advective numbers of 0.5, 1, 1.5 and 2. A damping 2/3 nu k^2
+    step of 0.0013, 0.024, 0.1 and 0.22 stops the growth at these numbers. In turbulence few points move at the largest
+    speed: 60 steps at three times the limit did not raise the energy tenfold (12^3 cells, turbulent Mach numbers from
+    0.01 to 0.5).
     """
     limits = [StepLimit("advection", "step x k_max x max(|u| + |v| + |w|)", step * k_max * speed, IMAGINARY_REACH)]
     if explicit:
@@ -97,7 +102,11 @@ def limits_of_step(k_max: float, step: float, speed: float, viscosity: float, ex
 
 
 def advice(fluid: Fluid, limits: Sequence[StepLimit], kmax_eta: float, mach: float = 0.0) -> str:
-    """Return the remedy for an unstable run: for exceeded limits, else for M_t > 1 (supersonic), else resolution."""
+    """Return text on the cause of an unstable run and its remedy.
+
+    The cause is the exceeded limits, if there are any. Otherwise it is a turbulent Mach number `mach` above 1, or else
+    a resolution `kmax_eta` that is too low.
+    """
     broken = [limit for limit in limits if limit.exceeded]
     if broken:
         return "Exceeded limits: " + "; ".join(f"{limit}: {REMEDIES[limit.name]}" for limit in broken)
@@ -113,7 +122,10 @@ def advice(fluid: Fluid, limits: Sequence[StepLimit], kmax_eta: float, mach: flo
 
 
 def quadratic_energy(fluid: Fluid, state: np.ndarray) -> float:
-    """Return <u.u>/2, plus c^2 <s^2>/2 for a compressible fluid. The linear terms never raise it."""
+    """Return <u.u>/2, plus c^2 <s^2>/2 for a compressible fluid, from the modes of a state; collective.
+
+    <.> is the mean over the box, and s = ln(rho / rho_0). The linear terms of the equations never raise this energy.
+    """
     energy = _half_square(state[:3])
     if fluid.compressible:
         energy += fluid.sound_speed**2 * _half_square(state[3:])
@@ -127,9 +139,9 @@ def _half_square(modes: np.ndarray) -> float:
 
 
 class StabilityWatch:
-    """Check of the energy after every step of a flow. It costs one small message and 0.1 % of a step.
+    """Checks the energy after every step of a flow. The check costs one small message and 0.1 % of a step.
 
-    `history` is the FlowHistory of the flow; the advice quotes its rows.
+    `history` is the FlowHistory of the flow. Its rows are quoted in the advice for an unstable run.
     """
 
     def __init__(self, fluid: Fluid, stepper: Callable, history: Any) -> None:

@@ -1,4 +1,8 @@
-"""Statistics of a flow: energy budget, scales, spectrum, moments of the velocity gradient."""
+"""Statistics of a flow: energy budget, scales, spectrum, and moments of the velocity gradient.
+
+Velocities are given by their modes (3, kz, ky, kx). <.> is the mean over the box. All functions with a grid are
+collective.
+"""
 
 import numpy as np
 
@@ -9,7 +13,7 @@ from eddies.spectral.spectral_grid import SpectralGrid
 def energy_spectrum(grid: SpectralGrid, velocity: np.ndarray) -> np.ndarray:
     """Return the spectrum E(k), k = 0, 1, ...: E(k) is the energy of the modes whose |k| rounds to k.
 
-    |k| is in units of 2 pi / length. The sum of E is <u.u>/2. Collective.
+    |k| is in units of 2 pi / length. The sum of E(k) over k is <u.u>/2.
     """
     shells = int(np.ceil(np.sqrt(3) * grid.cutoff)) + 1
     density = 0.5 * grid.multiplicity * (np.abs(velocity) ** 2).sum(axis=0)
@@ -18,7 +22,7 @@ def energy_spectrum(grid: SpectralGrid, velocity: np.ndarray) -> np.ndarray:
 
 
 def component_energies(grid: SpectralGrid, velocity: np.ndarray) -> dict[str, float]:
-    """Return the energies <u_i^2>/2 of the components as energy_x, energy_y and energy_z."""
+    """Return the energies <u_i^2>/2 of the three components under the names energy_x, energy_y and energy_z."""
     halves = np.array([0.5 * np.sum(grid.multiplicity * np.abs(component) ** 2, dtype=float) for component in velocity])
     total = global_sum(grid.decomposition.comm, halves)
     return {f"energy_{axis}": float(energy) for axis, energy in zip("xyz", total)}
@@ -29,6 +33,7 @@ def turbulence_scales(spectrum: np.ndarray, dissipation_rate: float, viscosity: 
 
     u'^2 = 2/3 sum E(k), L = pi/(2u'^2) sum E(k)/k, T = L/u', lambda = sqrt(15 nu u'^2/eps), Re_lambda = u' lambda/nu,
     eta = (nu^3/eps)^(1/4), t_eta = sqrt(nu/eps) (Pope 2000, chapter 6). If nu or eps is 0, viscous scales are 0 or inf.
+    `cutoff` is the largest wavenumber of the grid. The side of the box is 2 pi, so that wavenumbers are integers.
     """
     energy = spectrum.sum()
     u_rms = np.sqrt(2 * energy / 3)
@@ -51,7 +56,7 @@ def turbulence_scales(spectrum: np.ndarray, dissipation_rate: float, viscosity: 
 
 
 def gradient_moments(grid: SpectralGrid, velocity: np.ndarray) -> tuple[float, float]:
-    """Return skewness and flatness of the longitudinal gradient, averaged over du/dx, dv/dy and dw/dz."""
+    """Return the skewness and the flatness of the velocity gradient, each as the mean over du/dx, dv/dy and dw/dz."""
     def longitudinal(modes: np.ndarray) -> list[np.ndarray]:
         return [(grid.d_dx, modes[1:2]), (grid.d_dy, modes[2:3]), modes[3:]]
 
@@ -62,14 +67,14 @@ def gradient_moments(grid: SpectralGrid, velocity: np.ndarray) -> tuple[float, f
 
 
 def _powers(values: np.ndarray) -> np.ndarray:
-    """Return sums of squares, cubes and fourth powers of fields (c, planes, y, x): (3, c)."""
+    """Return the sums of the squares, of the cubes and of the fourth powers, (3, c), of the values of c fields."""
     flat = values.reshape(len(values), -1).astype(float, copy=False)
     squares = flat**2
     return np.stack([squares.sum(axis=1), (squares * flat).sum(axis=1), (squares * squares).sum(axis=1)])
 
 
 def _skewness_and_flatness(moments: np.ndarray) -> tuple[float, float]:
-    """Return skewness and flatness, averaged over the components, from moments of order 2, 3 and 4 (3, c)."""
+    """Return the skewness and the flatness, means over c fields, from `moments` (3, c) of order 2, 3 and 4."""
     second, third, fourth = moments
     if not np.all(second > 0):
         return 0.0, 0.0
@@ -77,7 +82,7 @@ def _skewness_and_flatness(moments: np.ndarray) -> tuple[float, float]:
 
 
 def incompressible_budget(grid: SpectralGrid, velocity: np.ndarray, viscosity: float) -> dict[str, float]:
-    """Return `total_energy`, <u.u>/2, and `dissipation_rate`, nu <|grad u|^2>."""
+    """Return `total_energy`, which is <u.u>/2, and `dissipation_rate`, which is nu <|grad u|^2>, by name."""
     squared = (np.abs(velocity) ** 2).sum(axis=0)
     return {"total_energy": 0.5 * grid.sum_modes(squared),
             "dissipation_rate": viscosity * grid.sum_modes(grid.wavenumber_squared * squared)}
@@ -85,12 +90,12 @@ def incompressible_budget(grid: SpectralGrid, velocity: np.ndarray, viscosity: f
 
 def compressible_budget(grid: SpectralGrid, state: np.ndarray, viscosity: float,
                         sound_speed: float) -> dict[str, float]:
-    """Return the energy budget of a compressible flow, and more statistics.
+    """Return the energy budget of a compressible flow, and more statistics, by name.
 
     `total_energy` is <rho |u|^2/2 + c^2 (rho ln rho - rho + 1)>. Without forcing it decays exactly at
-    `dissipation_rate`, nu <rho (2 S:S - 2/3 (div u)^2)>. `compressible_fraction` is the share of <u.u> in the
-    velocity along the wavevector. `density_rms` is the rms fluctuation of rho, with rho_0 = 1. `skewness` and
-    `flatness` are as in `gradient_moments`.
+    `dissipation_rate`, nu <rho (2 S:S - 2/3 (div u)^2)>, where S is the rate of strain. `compressible_fraction` is the
+    share of <u.u> that belongs to the component of each mode along its wavevector. `density_rms` is the rms fluctuation
+    of rho, in units of rho_0. `skewness` and `flatness` are as in `gradient_moments`.
     """
     def with_gradients(modes: np.ndarray) -> list[np.ndarray]:
         return [modes[:4], (grid.d_dx, modes[:3]), (grid.d_dy, modes[:3]), modes[4:]]

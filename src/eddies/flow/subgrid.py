@@ -8,10 +8,11 @@ from eddies.flow.statistics import energy_spectrum
 from eddies.spectral.mode_operators import gaussian_transfer, rising
 from eddies.spectral.spectral_grid import SpectralGrid
 
-# Number of times that each entry xx, yy, zz, xy, xz, yz occurs in a symmetric matrix.
+# How often each of the entries xx, yy, zz, xy, xz, yz occurs in a symmetric matrix.
 TIMES = np.array([1, 1, 1, 2, 2, 2])
-# Constants of nu_t (k_c / E(k_c))^(1/2): the value far below k_c, and size and rate of the exponential growth near k_c
-# (Chollet and Lesieur 1981, in the form of Lesieur and Metais 1996, Kolmogorov constant 1.4).
+# Constants of nu_t (k_c / E(k_c))^(1/2) in `SpectralViscosity`: its value far below k_c, and the size and the rate of
+# its exponential growth near k_c (Chollet and Lesieur 1981, in the form of Lesieur and Metais 1996, with the Kolmogorov
+# constant 1.4).
 PLATEAU, CUSP, STEEPNESS = 0.267, 34.5, 3.03
 
 
@@ -19,7 +20,7 @@ class Closure:
     """Base of all closures. Velocities and forces are modes (3, kz, ky, kx)."""
 
     def begin_step(self, velocity: np.ndarray) -> None:
-        """Compute, from the velocity at the start of a step, what stays constant during the step; collective."""
+        """Compute the quantities that stay constant during a step from the velocity at its start; collective."""
 
     def add(self, velocity: np.ndarray, tendency: np.ndarray) -> None:
         """Add the force to `tendency`, the rate of change of the velocity, in place."""
@@ -31,10 +32,10 @@ class StressModel(Closure):
 
         tau = (d^2/12) grad u grad u^T - 2 l^2 |S| S,    S = (grad u + grad u^T) / 2,   |S| = (2 S:S)^(1/2).
 
-    The first part is the leading term of the stress that a filter of width d hides (Leonard 1975; Clark et al. 1979).
-    The second is an eddy viscosity l^2 |S| with the mixing length l (Smagorinsky 1963), which dissipates energy at
-    the rate <2 l^2 |S| S:S>. Either l or d may be 0. The stress is computed at the grid points. The 2/3 rule does not
-    remove the aliasing errors of |S|.
+    The first part, the gradient part, is the leading term of the stress that a filter of width d hides (Leonard 1975;
+    Clark et al. 1979). The second part is the stress of an eddy viscosity l^2 |S| with the mixing length l (Smagorinsky
+    1963). It dissipates energy at the rate <2 l^2 |S| S:S>. Either l or d may be 0. The stress is computed at the grid
+    points. The 2/3 rule does not remove the aliasing errors of |S|.
 
     Parameters
     ----------
@@ -62,7 +63,10 @@ class StressModel(Closure):
         return self.modes_of(tau, velocity)
 
     def modes_of(self, formula: Callable[[np.ndarray], np.ndarray], velocity: np.ndarray) -> np.ndarray:
-        """Return the modes of `formula`, which maps velocity gradients (9, ...) at grid points to values (6, ...)."""
+        """Return the modes (6, kz, ky, kx) of a formula of the velocity gradients.
+
+        `formula` maps the gradients (9, ...) at grid points to values (6, ...).
+        """
         grid = self.grid
 
         def gradients(modes: np.ndarray) -> list[np.ndarray]:
@@ -75,19 +79,21 @@ class StressModel(Closure):
 
 
 class DynamicStress(StressModel):
-    """StressModel with one mixing length for the box, computed from the resolved scales at the start of each step
-    (Germano et al. 1991; Lilly 1992; with the gradient part Vreman et al. 1994):
+    """StressModel with one mixing length l for the box. Each step computes l at its start, from the resolved scales.
+
+    The formula is (Germano et al. 1991; Lilly 1992; with the gradient part Vreman et al. 1994)
 
         l^2 = max(<(L - H):M> / <M:M>, 0),   L = (uu)^ - u^ u^,   M = 2 ((|S|S)^ - r |S^|S^).
 
-    ^ denotes the test filter. It acts on fields that have passed the first filter, the one of the simulation. Both
-    together form the combined filter. r is the squared width of the combined filter divided by that of the first.
-    H is the gradient part of the combined filter's stress, minus the test-filtered gradient part of the first filter's
-    stress.
+    ^ denotes the test filter, S^ the rate of strain of u^, and <.> the mean over the box. The test filter acts on
+    fields that have passed the first filter, the one of the simulation. Both together form the combined filter. r is
+    the squared width of the combined filter divided by that of the first. H is the gradient part for the combined
+    filter, minus the gradient part for the first filter, to which ^ is applied. If not `with_gradient`, the stress has
+    no gradient part, and H = 0.
 
     With a filter width d, the first filter is Gaussian of width d, ^ is Gaussian of width 2 d, and r = 5. If the filter
-    width is 0, the first filter is the grid, and ^ cuts off above half the highest wavenumber of the grid. All tensors
-    then have only the modes up to this cutoff.
+    width is 0, the first filter is the grid, and ^ removes the modes above half the highest wavenumber of the grid. The
+    tensors L, H and M then have only the modes up to this wavenumber.
     """
 
     def __init__(self, grid: SpectralGrid, filter_width: float, with_gradient: bool = False) -> None:
@@ -112,13 +118,13 @@ class DynamicStress(StressModel):
         self.squared_length = max(numerator / norm, 0.0) if norm > 0 else 0.0
 
     def _contraction(self, one: np.ndarray, other: np.ndarray) -> float:
-        """Return <A:B> of two symmetric tensors. Only the modes that pass the test filter count."""
+        """Return <A:B> of two symmetric tensors given by modes (6, ...). Only modes that pass the test filter count."""
         products = np.tensordot(TIMES, (one.conj() * other).real, axes=1)
         return self.grid.sum_modes(np.where(self.test > 0, products, 0))
 
 
 class ModeDamping(Closure):
-    """Force -a D(k) u with a fixed shape D (kz, ky, kx) and an amplitude a that `begin_step` measures."""
+    """Force -a D(k) u with a fixed function D (kz, ky, kx). `begin_step` computes the amplitude a."""
 
     def __init__(self, grid: SpectralGrid, shape: np.ndarray) -> None:
         self.grid, self.shape, self.amplitude = grid, shape, 0.0
@@ -128,11 +134,12 @@ class ModeDamping(Closure):
 
 
 class SpectralViscosity(ModeDamping):
-    """Force -nu_t(k) k^2 u with the eddy viscosity of modes beyond a sharp cut-off k_c (Chollet and Lesieur 1981):
+    """Force -nu_t(k) k^2 u with the eddy viscosity of a sharp cut-off at k_c (Chollet and Lesieur 1981):
 
         nu_t = 0.267 (E(k_c)/k_c)^(1/2) (1 + 34.5 exp(-3.03 k_c/k)).
 
-    E(k_c) is the energy of the last shell that the grid holds completely.
+    k_c is the highest wavenumber of the grid along each axis. E(k_c) is the energy of the last shell of modes that the
+    grid holds completely.
     """
 
     def __init__(self, grid: SpectralGrid) -> None:
@@ -147,8 +154,8 @@ class EddyDamping(ModeDamping):
     """Force -D(k) u with the learned damping D of the particle model.
 
     D = k_c u_c f(k). The function f has the values `rates` at wavenumbers that are equally spaced up to k_c. It is
-    linear between these wavenumbers, and f(0) = 0. k_c is the highest wavenumber of the grid. u_c is the rms of one
-    velocity component, from the modes above k_c/2.
+    linear between these wavenumbers, and f(0) = 0. k_c is the highest wavenumber of the grid. u_c is the rms of a
+    velocity component in the modes above k_c/2.
     """
 
     def __init__(self, grid: SpectralGrid, rates: np.ndarray) -> None:
@@ -160,7 +167,7 @@ class EddyDamping(ModeDamping):
 
 
 def strain_product(gradients: np.ndarray) -> np.ndarray:
-    """Return |S| S (6, ...) of velocity gradients (9, ...) in the order du/dx, dv/dx, dw/dx, du/dy, ..."""
+    """Return |S| S (6, ...) from velocity gradients (9, ...) in the order du/dx, dv/dx, dw/dx, du/dy, ..."""
     d_dx, d_dy, d_dz = gradients.reshape(3, 3, *gradients.shape[1:])
     strain = np.stack([d_dx[0], d_dy[1], d_dz[2],
                        (d_dx[1] + d_dy[0]) / 2, (d_dx[2] + d_dz[0]) / 2, (d_dy[2] + d_dz[1]) / 2])
@@ -169,6 +176,6 @@ def strain_product(gradients: np.ndarray) -> np.ndarray:
 
 
 def gradient_product(gradients: np.ndarray) -> np.ndarray:
-    """Return d_k u_i d_k u_j (6, ...) of velocity gradients (9, ...) in the order du/dx, dv/dx, dw/dx, du/dy, ..."""
+    """Return d_k u_i d_k u_j (6, ...) from velocity gradients (9, ...) in the order du/dx, dv/dx, dw/dx, du/dy, ..."""
     u, v, w = np.moveaxis(gradients.reshape(3, 3, *gradients.shape[1:]), 1, 0)
     return np.stack([(a * b).sum(axis=0) for a, b in ((u, u), (v, v), (w, w), (u, v), (u, w), (v, w))])

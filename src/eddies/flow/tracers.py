@@ -12,9 +12,9 @@ from eddies.spectral.spectral_grid import SpectralGrid
 
 
 def random_positions(seed: int, total: int, start: int, stop: int, length: float) -> np.ndarray:
-    """Return uniformly random positions (stop - start, 3) of the particles with ids start ... stop - 1.
+    """Return uniformly random positions (stop - start, 3), in [0, length), of the ids start ... stop - 1.
 
-    A position depends only on `seed`, `total` and the id, not on the number of ranks.
+    The position of a particle depends only on `seed`, `total` and its id, not on the number of ranks.
     """
     # Philox yields four 64-bit numbers per counter value; each particle takes one counter value.
     generator = np.random.Generator(np.random.Philox(key=[seed, total]).advance(start))
@@ -22,7 +22,10 @@ def random_positions(seed: int, total: int, start: int, stop: int, length: float
 
 
 def lattice_positions(seed: int, per_side: int, start: int, stop: int, length: float) -> np.ndarray:
-    """Return lattice positions of ids start ... stop - 1; each coordinate is displaced at random by up to 1/4 cell."""
+    """Return positions (stop - start, 3) of the ids start ... stop - 1, near the points of a lattice.
+
+    The lattice has `per_side` points along each axis. Each coordinate is displaced at random by up to 1/4 cell.
+    """
     ids = np.arange(start, stop)
     cell = length / per_side
     corner = np.stack([ids % per_side, ids // per_side % per_side, ids // per_side**2], axis=1)
@@ -31,7 +34,7 @@ def lattice_positions(seed: int, per_side: int, start: int, stop: int, length: f
 
 
 def release(decomposition: SlabDecomposition, seed: int, total: int, placement: str) -> dict[str, np.ndarray]:
-    """Return `id` and `position` of new particles; each particle is on the rank whose slab holds it.
+    """Return `id` and `position` of those of `total` new particles that lie in this rank's slab; collective.
 
     `placement` is "random" or "lattice"; for a lattice, `total` is the cube of an integer.
     """
@@ -46,8 +49,8 @@ def release(decomposition: SlabDecomposition, seed: int, total: int, placement: 
 class FilteredField:
     """Gaussian-filtered velocity at arbitrary points, and in a compressible flow also the filtered density.
 
-    Points may lie in this rank's slab or in the `margin` planes on each side of it. So a particle may cross at most
-    `margin` planes in a step.
+    A `filter_width` of 0 means no filter. Points may lie in this rank's slab or in the `margin` planes on each side of
+    it. So a particle may cross at most `margin` planes in a step.
     """
 
     def __init__(self, grid: SpectralGrid, filter_width: float, interpolation: str, margin: int = 1) -> None:
@@ -65,10 +68,10 @@ class FilteredField:
 
 
 class TracerParticles:
-    """Advection dx/dt = v(x, t) by the filtered velocity with Heun's method, second order in time.
+    """Particles that move with the filtered velocity v, dx/dt = v(x, t), by Heun's method of second order.
 
-    `columns` holds `id`, `position` and `velocity` of this rank's particles. `velocity` is the filtered velocity at the
-    particle; an absent `velocity` is computed from `state`.
+    `columns` holds `id`, `position` and `velocity` of this rank's particles. `velocity` is v at the particles. If it is
+    not given, it is computed from `state`, the modes of the flow.
     """
 
     def __init__(self, field: FilteredField, columns: dict[str, np.ndarray], state: np.ndarray) -> None:
@@ -80,7 +83,7 @@ class TracerParticles:
             self.columns = {**columns, "velocity": velocity}
 
     def advance(self, state: np.ndarray, step: float) -> None:
-        """Advance the particles by one step; `state` is the flow at the end of the step."""
+        """Advance the particles by a time step; `state` is the flow at the end of the step. Collective."""
         coefficients = self.field.velocity_coefficients(state)
         position, velocity = self.columns["position"], self.columns["velocity"]
         predicted = position + step * velocity

@@ -276,10 +276,10 @@ class ForceTrainer:
                          count: int) -> dict[str, Tensor]:
         """Return this rank's shares of the trajectory loss and the power loss, which are means over `count` particles.
 
-        `rows` are the indices of those particles that this rank owns, and `errors` are their errors. The trajectory loss
-        is Eq. 12 with centred differences of the velocity as the true acceleration. Each rate is divided by its rms in
-        the frame, so that all frames of a decaying flow count alike. A learned density rate is part of the trajectory
-        loss, unless a term of this rate is learned through several steps of the simulation.
+        `rows` are the indices of those particles that this rank owns, and `errors` are their errors. The trajectory
+        loss is Eq. 12 with centred differences of the velocity as the true acceleration. Each rate is divided by its
+        rms in the frame, so that all frames of a decaying flow count alike. A learned density rate is part of the
+        trajectory loss, unless a term of this rate is learned through several steps of the simulation.
         """
         share = mean_square_share(errors["acceleration"], frame.acceleration_rms, count)
         if self.model.regresses_density:
@@ -313,8 +313,9 @@ class ForceTrainer:
         With a filtered velocity u one frame later, the error is (<v> - u) / span. v = v_before + span a is the model's
         velocity after a midpoint step of length span, from the frame before to the frame after. True accelerations are
         centred differences, so v = v_true + span (a - a_true), where v_true is the true velocity in the frame after.
-        The positions at the end of the step are the true ones, because a midpoint step computes them from the velocity in
-        its middle, not from a. The error is therefore <a - a_true> plus the error of the kernel, (<v_true> - u) / span.
+        The positions at the end of the step are the true ones, because a midpoint step computes them from the velocity
+        in its middle, not from a. The error is therefore <a - a_true> plus the error of the kernel, (<v_true> - u) /
+        span.
         """
         within, later, points = frame.within(self.kernel), frame.later, self._points[inside]
         change = torch.zeros_like(frame.acceleration).index_add(0, rows, error)
