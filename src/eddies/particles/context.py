@@ -26,8 +26,8 @@ from eddies.particles.rates import described
 from eddies.particles.resolved_velocity import ResolvedFlow, ResolvedVelocity
 from eddies.scene.terms import TermError
 
-# Numbers that sums over pairs hold in memory at once if no gradient is recorded: they fit a core's cache, or part of a
-# GPU's memory.
+# By device: how many numbers sums over pairs hold in memory at once if no gradient is recorded. They fit the cache of a
+# core, or a part of the memory of a GPU.
 PAIR_VALUES_TOGETHER = {"cpu": 1 << 19, "cuda": 1 << 26}
 # This fraction of the values for evenly spread neighbours is added to moment matrices and sums of weights. They can
 # then be inverted even without neighbours or with only coplanar ones. In all other cases the bias is 0.1 %.
@@ -43,7 +43,7 @@ class PairSum:
     width : largest number of values that a pair needs at once; it determines how many pairs are evaluated together.
     mutual : whether the values of pair (j, i) are `parity` times those of (i, j). Each pair is then evaluated once.
     parity : (components,), 1 or -1 for each component.
-    needs_moments : whether a term uses `context.moments` with its sums.
+    needs_moments : whether the sums are used together with `context.moments`.
     """
 
     width = 8
@@ -57,13 +57,16 @@ class PairSum:
                         "(components, m)")
 
     def compiled(self, context: Context) -> CompiledSum | None:
-        """The same sum for the compiled library, or None. Subclasses do not inherit it; each must define its own."""
+        """Return the same sum for the compiled library, or None without one.
+
+        A subclass does not inherit this method: if it does not define its own, torch computes its sum.
+        """
         return None
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Moments of the particles' neighbourhoods: inverse (6, k) of sum_j w x x^T, and weight (1, k), sum_j w."""
+    """Moments of the neighbourhoods of k particles: `inverse` (6, k) of sum_j w x x^T, and `weight` (1, k), sum_j w."""
 
     inverse: Tensor
     weight: Tensor
@@ -79,8 +82,8 @@ class Context:
     flow : units of the model.
     local : the s particles that this rank sees, owned ones and ghosts; None if no term reads pairs.
     resolution : finds the resolved velocity; None if no term reads it.
-    rows : (k,), the particles for which acceleration and density rate are computed; None: all.
-    dtype : type of the pair arithmetic; None: the type of the positions.
+    rows : (k,), the requested particles, for which rates are computed; None: all.
+    dtype : floating-point type of computations with pairs; None: that of the positions.
     density : (n,), density of the particles; None if terms give it, or if no term reads it.
     time : time of the evaluation in a run. The solve for the resolved velocity starts from a prediction for this time;
         None: no prediction.
@@ -109,18 +112,19 @@ class Context:
 
     @property
     def everywhere(self) -> Context:
-        """The same context for all owned particles instead of some rows."""
+        """The same context with all owned particles as the requested ones."""
         return self if self.rows is None else self.of_rows(None)
 
     def of_rows(self, rows: Tensor | None) -> Context:
-        """The same context for other rows of the owned particles; None: all."""
+        """Return the same context with other requested particles; None: all owned ones."""
         other = copy(self)
         other.rows, other._sums = rows, {}
         vars(other).pop("moments", None)
         return other
 
     def column(self, name: str) -> Tensor:
-        """Column "velocity" (s, 3) or "density" (s,) of the particles that this rank sees, owned first; collective."""
+        """Return the column "velocity" (s, 3) or "density" (s,) of the owned particles, then of the ghosts; collective.
+        """
         around = self.local.neighborhood
         if name not in self._columns:
             owned = self.density if name == "density" else getattr(self.particles, name)
@@ -131,7 +135,7 @@ class Context:
 
     @property
     def own_density(self) -> Tensor:
-        """Density (k,) of the particles for which rates are computed."""
+        """Density (k,) of the requested particles."""
         density = self.column("density")[: len(self.particles)]
         return density if self.rows is None else density[self.rows]
 
@@ -151,13 +155,13 @@ class Context:
         return self._resolution.of(self.particles, self._time)
 
     def without_mean(self, rows: Tensor) -> Tensor:
-        """Rows (n, c) of the owned particles minus their mean over all particles of all ranks; collective."""
+        """Subtract from rows (n, c) of the owned particles the mean row over the particles of all ranks; collective."""
         return rows - mean_over_ranks(self.comm, rows)
 
     # ---- sums over pairs
 
     def pair_sums(self, term: PairSum) -> Tensor:
-        """Sums (components, k) of a term over the neighbours of each particle; collective."""
+        """Return the sums (components, k) of a term over the neighbours of each requested particle; collective."""
         if term not in self._sums:
             self.sum_pairs([term])
         return self._sums[term]
@@ -176,7 +180,7 @@ class Context:
                        sums[:1] + REGULARISATION * moments.expected_weight(flow.neighbors))
 
     def sum_pairs(self, terms: Sequence[PairSum]) -> None:
-        """Compute the sums of terms together, with the moments if a term needs them; collective."""
+        """Compute and store the sums of several terms together, and the moments if a term needs them; collective."""
         needs_moments = any(term.needs_moments for term in terms)
         summands = [each for each in (*terms, *([_MOMENTS] if needs_moments else [])) if each not in self._sums]
         if not summands:
@@ -188,9 +192,9 @@ class Context:
             self._sums |= zip(rest, self._torch_sums(rest))
 
     def _compiled_request(self, summand: PairSum) -> CompiledSum | None:
-        """Description of a sum for the compiled library.
+        """Return a sum in the form of the compiled library.
 
-        None if the sum has no compiled form, or if the library does not support the device.
+        The result is None if the sum has no compiled form, or if the library does not support the device.
         """
         request = vars(type(summand)).get("compiled")
         return request(summand, self) if request and kernels_serve(self.particles.position.device) else None
@@ -232,8 +236,8 @@ class Context:
 
 
 def _values(summand: PairSum, pairs: ScaledPairs) -> Tensor:
-    """Values (components, m) of a summand for m pairs. Raises TermError, which names the class, if `pair_values` fails
-    or returns anything but real numbers of this shape."""
+    """Return the values (components, m) of a summand for m pairs. Raises TermError, which names the class, if
+    `pair_values` fails or returns anything but real numbers of this shape."""
     with users_code(type(summand), TermError):
         values = summand.pair_values(pairs)
     count = len(pairs.pairs.distance)

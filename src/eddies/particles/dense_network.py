@@ -35,8 +35,8 @@ class DenseNetwork(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """Outputs (outputs, m) of features (inputs, m).
 
-        It uses tanh(z) = 2 sigmoid(2 z) - 1, with the factors moved into the small weight matrices: the sigmoid is
-        several times faster than tanh on a CPU.
+        The tanh is computed as tanh(z) = 2 sigmoid(2 z) - 1, with the factors moved into the small weight matrices:
+        the sigmoid is several times faster than tanh on a CPU.
         """
         values = torch.sigmoid(torch.addmm(2 * self.biases[0], 2 * self.weights[0], features))
         for weight, bias in zip(self.weights[1:-1], self.biases[1:-1]):

@@ -49,7 +49,7 @@ class ParticleDynamics:
             self.neighborhood = Neighborhood(decomposition, model.flow.cutoff, skin)
 
     def forget(self) -> None:
-        """Rebuild halo and list at the next evaluation.
+        """Make the next evaluation rebuild halo and neighbour list.
 
         A run that does so at each checkpoint is bitwise equal to a run that continues from the checkpoint.
         """
@@ -62,7 +62,10 @@ class ParticleDynamics:
         self._local = None
 
     def built_at(self, particles: ParticleSet) -> Tensor | None:
-        """Positions (n, 3) of these particles at the last build of halo and list; None if that was for others."""
+        """Return the positions (n, 3) of these particles at the last build of halo and neighbour list.
+
+        The result is None if the last build was for other particles, or if there is no neighbour list.
+        """
         return None if self.neighborhood is None else self.neighborhood.built_at(particles)
 
     def rebuild(self, particles: ParticleSet, built_at: Tensor) -> None:
@@ -121,7 +124,7 @@ class ParticleDynamics:
 
     def rates(self, particles: ParticleSet, rows: Tensor | None = None, kept: Mapping[str, LinearRates] | None = None,
               density: Tensor | None = None, time: float | None = None) -> Rates:
-        """Rates of change of the owned particles, or of `rows` (k,) of them; see LagrangianModel.rates.
+        """Return the rates of change of the owned particles, or of `rows` (k,) of them; see LagrangianModel.rates.
 
         `kept` holds stored rates by name of the term; these terms are not evaluated. `density` (n,) replaces the
         density that terms would give. If `time` is given, the solve for the resolved velocity starts from a prediction
@@ -130,7 +133,10 @@ class ParticleDynamics:
         return self.model.rates(self.context(particles, rows, density, time), kept)
 
     def rates_after(self, delay: float, particles: ParticleSet) -> Rates:
-        """Rates within a step, at the time `delay` after its beginning. Later predictions use this evaluation."""
+        """Return the rates at the time `delay` after the beginning of the present step.
+
+        Later predictions of the resolved velocity use this evaluation.
+        """
         context = self.context(particles, time=self.time + delay)
         rates = self.model.rates(context)
         if self.resolution is not None:

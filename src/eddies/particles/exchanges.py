@@ -1,4 +1,4 @@
-"""Communication between ranks on tensors: ghost particles, sums and means, all differentiable, and error norms."""
+"""Tensors over all ranks: ghost particles, sums and means, which are differentiable, and norms, which are not."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from eddies.particles.particle_set import as_numpy
 
 
 class _GhostExchange(torch.autograd.Function):
-    """Send rows of owned particles to ranks that have them as ghosts. The backward pass adds ghost gradients to owners.
+    """Send rows of owned particles to ranks that have them as ghosts.
+
+    The backward pass sends the gradients of ghosts back and adds them to the gradients of the owned rows.
 
     Both directions are collective. If all ranks compute the same expression, with any number of particles, they also
     take part in the backward exchanges in the same order.

@@ -29,7 +29,7 @@ def pair_features(dynamics: ParticleDynamics, particles: ParticleSet) -> Iterato
 
 @dataclass(frozen=True)
 class FeatureRange:
-    """Smallest and largest value, both (features,), of each input of the networks over all pairs of the training.
+    """Smallest and largest value, both (features,), of each input of the networks over all pairs in the training.
 
     Outside this range the network extrapolates: its values are smooth but were never compared with the truth.
     """
@@ -39,7 +39,7 @@ class FeatureRange:
 
     @classmethod
     def of(cls, comm: Comm, blocks: Iterable[Tensor]) -> FeatureRange:
-        """Range over the blocks (features, m) of all ranks; collective. Each rank must have at least one block."""
+        """Find the range over the blocks (features, m) of all ranks; collective. Each rank must have a block."""
         low, high = zip(*map(_extrema, blocks))
         return cls(global_min(comm, np.min(low, axis=0)), global_max(comm, np.max(high, axis=0)))
 

@@ -44,7 +44,8 @@ class ReferenceScales:
     density : rms of the density fluctuation rho - rho_0.
     density_rate : rms of the rate of change of density along trajectories.
     sound_speed : speed of sound c.
-    kolmogorov_length : eta of the flow before the filter; its spectrum ends near 1/eta. 0 without viscosity.
+    kolmogorov_length : Kolmogorov length eta of the flow before the filter, whose spectrum ends near k = 1/eta; 0
+        without viscosity.
 
     Scales of density and sound are None for an incompressible ground truth. A flow at another Mach number supplies its
     own scales to the same network. Raises ScaleError unless all given scales are finite and positive; viscosity and
@@ -72,7 +73,7 @@ class ReferenceScales:
                 raise ScaleError(f"reference scale {name} = {value}: must be finite and {allowed}; {remedy}")
 
     def required(self, name: str) -> float:
-        """A scale by name. Raises ValueError if it is None: a flow without density has no scale of density or sound."""
+        """Return a scale by name. Raises ValueError if it is None, as scales of density and sound may be."""
         value = getattr(self, name)
         if value is None:
             raise ValueError(f"reference scale {name}: a flow without density has none")
@@ -83,13 +84,13 @@ class ReferenceScales:
 
 
 def resolved_wavenumber(spacing: float, filter_width: float, kolmogorov_length: float) -> float:
-    """k_c, the highest wavenumber of a filtered velocity that particles with this spacing resolve."""
+    """Return k_c, the highest wavenumber of a filtered velocity that particles with this spacing resolve."""
     highest = min(BEYOND_NYQUIST * math.pi / spacing, math.sqrt(-24 * math.log(LEAST_TRANSFER)) / filter_width)
     return min(highest, BEYOND_DISSIPATION / kolmogorov_length) if kolmogorov_length > 0 else highest
 
 
 def allowed_step(angle: float, highest: float, speed: float) -> float:
-    """Longest time step for velocities resolved up to a wavenumber k_c = `highest`; infinite at rest.
+    """Return the longest time step for velocities resolved up to a wavenumber k_c = `highest`; infinite at rest.
 
     `speed` is the rms u' of a velocity component. In a step dt, a particle with this velocity crosses the phase
     `angle` = k_c u' dt, in radians, of a wave with the wavenumber k_c.
@@ -99,7 +100,7 @@ def allowed_step(angle: float, highest: float, speed: float) -> float:
 
 @dataclass(frozen=True)
 class FlowUnits:
-    """Scales of a flow, which make terms dimensionless, and the size of its particles' neighbourhoods.
+    """Scales of a flow, which make terms dimensionless, and the size of the neighbourhoods of its particles.
 
     Parameters
     ----------
@@ -121,11 +122,12 @@ class FlowUnits:
 
 
 def measured_scales(comm: Comm, at: Columns, after: Columns, interval: float) -> dict[str, float]:
-    """Rms of velocity, density and their rates over all particles; of vectors, the rms of one component. Collective.
+    """Measure the rms of velocity, density and their rates of change over all particles; collective.
 
-    Returns "velocity_rms" and "density_rms" (of the fluctuation) in the frame `at`, and "acceleration_rms" and
-    "density_rate_rms": the rms of the change from `at` to the frame `after`, divided by `interval`, the time between
-    them. Both frames are this rank's rows of `velocity` (n, 3) and, optionally, `density` (n,), of the same particles.
+    The rms of a vector is that of one component. Returns "velocity_rms" and "density_rms" (of the fluctuation) in the
+    frame `at`. Returns also "acceleration_rms" and "density_rate_rms", the rms of the change from `at` to the frame
+    `after`, divided by `interval`, the time between the two frames. Both frames are this rank's rows of `velocity`
+    (n, 3) and, optionally, `density` (n,), of the same particles.
     """
     scales = {}
     for name, rate in RATES.items():

@@ -26,7 +26,7 @@ class Form:
     ----------
     name : "average", Eqs. 5 and 6; "linear" or "quadratic", moving least squares (`ParticleField.fitted`); or
         "kriging", the best linear estimate for the covariance of filtered turbulence.
-    kernel : the learned W. Only averages accept negative weights.
+    kernel : the learned kernel W. Only the form "average" accepts a W with negative values.
     filter_width : d of the filter that the velocities have passed.
     mean_volume : mean volume of a particle.
     """
@@ -61,7 +61,8 @@ class Form:
         return self.at(field, field.points)[0]
 
     def _kriged(self, field: ParticleField, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Kriging; a quadratic fit where there are too many neighbours or the equations are singular."""
+        """Reconstruct as in `at`, by kriging. A quadratic fit replaces it at points where a neighbourhood has too many
+        particles or the equations are singular."""
         velocity, gradient = field.kriged(self.filter_width, points)
         solved = velocity.isfinite().all(1) & gradient.isfinite().all(2).all(1)
         failed = torch.nonzero(~solved).squeeze(1)

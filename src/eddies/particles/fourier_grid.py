@@ -22,10 +22,11 @@ from eddies.spectral.spectral_grid import SYMMETRIC, SpectralGrid
 
 
 class FourierGrid(ModeOperators):
-    """A periodic grid with as many cells along each axis as all slabs have planes, and its modes |k_i| <= `resolved`.
+    """A periodic grid and its Fourier modes. Along each axis it has as many cells as all slabs together have planes.
 
-    Fields are real tensors (c, z_local, y, x), modes complex ones (c, kz, ky, kx) as in `SpectralGrid`, on the host and
-    in the precision of `dtype`. Values at positions are in double precision. Positions (n, 3) lie in this rank's
+    Modes have |k_i| <= `resolved` for each component of k, in units of the smallest wavenumber. Fields are real tensors
+    (c, z_local, y, x), modes complex ones (c, kz, ky, kx) as in `SpectralGrid`, on the host and in the precision of
+    `dtype`. Values at positions are in double precision. Positions (n, 3) lie in this rank's
     slab or at most `reach` outside it; `reach` is the thickness of `margin` grid planes. Methods that convert between
     particles, fields and modes are collective, also in the backward pass.
     """
@@ -70,8 +71,8 @@ class FourierGrid(ModeOperators):
     def spread(self, values: Tensor, points: Points) -> Tensor:
         """Modes (c, kz, ky, kx) of the sum of the splines around points, each times its row of `values` (n, c).
 
-        Differentiable in values and positions. It is the adjoint of `at` up to factors: the number of grid points and
-        the multiplicity of modes.
+        Differentiable in values and positions. Up to two factors, the number of grid points and the multiplicity of the
+        modes, it is the adjoint of `at`.
         """
         return self.to_modes(_Spread.apply(values, points.position, points)) * self.prefilter
 
@@ -81,7 +82,7 @@ class FourierGrid(ModeOperators):
     # ---- formulas on modes
 
     def filter_transfer(self, width: float) -> Tensor:
-        """Transfer function G of the filter, `gaussian_transfer`, for each mode (kz, ky, kx)."""
+        """Transfer function G (kz, ky, kx) of the Gaussian filter of this width; see `gaussian_transfer`."""
         if width not in self._transfers:
             self._transfers[width] = torch.from_numpy(gaussian_transfer(self.spectral.wavenumber_squared, width))
         return self._transfers[width]
@@ -98,24 +99,24 @@ class FourierGrid(ModeOperators):
         return Rates(force_modes=-(divergence + self.gradient(pressure)), pressure_modes=pressure)
 
     def slopes(self, vector: Tensor) -> Tensor:
-        """Fields d_j u_i of a vector's modes: (3, 3, z_local, y, x) [component, direction]."""
+        """Fields d_j u_i (3, 3, z_local, y, x), with indices i, j, of a vector u given by its modes."""
         modes = torch.cat([self.gradient(component) for component in vector])
         return self.to_fields(modes).unflatten(0, (3, 3))
 
     def products(self, first: Tensor, second: Tensor) -> Tensor:
         """Modes (6, kz, ky, kx) of the products a_i b_j of two fields (3, ..., z_local, y, x), ij = xx, yy, zz, xy, ...
 
-        Products are summed over the axes between the component and the grid.
+        If the fields have more axes between the component and the grid, the products are summed over these axes.
         """
         fields = [first[i] * second[j] for i, j in SYMMETRIC]
         return self.to_modes(torch.stack([field.sum(0) if field.dim() > 3 else field for field in fields]))
 
     def squares(self, vector: Tensor) -> Tensor:
-        """Modes (6, kz, ky, kx), |k| <= `resolved`, of u_i u_j for a vector's modes."""
+        """Modes (6, kz, ky, kx) with |k| <= `resolved` of the products u_i u_j of a vector u given by its modes."""
         return self.within(_Squares.apply(vector, self))
 
     def within(self, vector: Tensor) -> Tensor:
-        """The modes of a vector with |k| <= `resolved`; others are set to zero."""
+        """Set the modes of a vector with |k| > `resolved` to zero."""
         return vector * self._sphere
 
 
@@ -130,7 +131,7 @@ class Points:
         return self.spline.around(as_numpy(self.position))
 
     def at(self, parts: Sequence[np.ndarray]) -> Tensor:
-        """Values (n, c) at the positions, from planes of spline coefficients with ghost planes."""
+        """Values (n, c) at the positions. `parts` are the planes of spline coefficients together with ghost planes."""
         return torch.from_numpy(self._splines.at(parts)).to(self.position.device)
 
     def slope_along(self, parts: Sequence[np.ndarray], factors: Tensor) -> Tensor:
@@ -142,8 +143,8 @@ class Points:
         return torch.from_numpy(self.spline.spread(as_numpy(values.double()), self._splines))
 
 
-# Modes with kx > 0 count twice, so the backward transform is the adjoint of the forward transform up to the factors
-# `multiplicity` and number of grid points.
+# Modes with kx > 0 count twice in a sum over all modes. So the backward transform is the adjoint of the forward one up
+# to two factors, `multiplicity` and the number of grid points.
 
 
 class _ToModes(torch.autograd.Function):
@@ -173,7 +174,7 @@ class _ToFields(torch.autograd.Function):
 
 
 class _Squares(torch.autograd.Function):
-    """`FourierGrid.products` of a vector with itself, a few planes at a time.
+    """`FourierGrid.products` of a vector with itself, computed for a few planes at a time.
 
     Fields are not stored; the backward pass computes them again.
     """

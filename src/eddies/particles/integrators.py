@@ -17,8 +17,9 @@ from eddies.scene.integrators import SCHEMES, Scheme
 class Integrator:
     """A time stepping scheme.
 
-    `memory` holds the rates that a step passes to the next one, with rows as in the particles last returned. `restore`
-    sets it. If `scheme.dense`, a call of `rates` between two steps costs nothing: the next step uses its result.
+    `memory` holds, by name, the rates that a step passes to the next one. Their rows belong to the particles that the
+    last call returned. `restore` sets `memory`. If `scheme.dense`, a call of `rates` between two steps costs nothing:
+    the next step uses its result.
     """
 
     scheme: Scheme
@@ -71,7 +72,7 @@ class VelocityVerlet(Integrator):
 class CorrectedVerlet(Integrator):
     """Velocity Verlet that evaluates the rates again at the final velocity and density (Besold et al. 2000, DPD-VV).
 
-    Both evaluations have the same positions and share neighbour list and kriging weights. For rates that depend on
+    Both evaluations have the same positions, and share the neighbour list and kriging weights. For rates that depend on
     velocity alone the scheme is Heun's method of second order, stable up to twice the step of velocity Verlet. The
     shift velocity is that at the start of the step, which is accurate to first order.
     """
@@ -123,7 +124,10 @@ INTEGRATORS: dict[str, Callable[[ParticleDynamics], Integrator]] = {
 
 def _kick_drift_kick(dynamics: ParticleDynamics, particles: ParticleSet, start: Rates,
                      time_step: float) -> tuple[ParticleSet, Rates]:
-    """Particles a step later, and the rates at their predicted velocity and density; collective."""
+    """Return the particles a step later, and the rates at their predicted velocity and density; collective.
+
+    `start` holds the rates at the beginning of the step.
+    """
     position = particles.position + time_step * (_pace(particles, start) + 0.5 * time_step * start.velocity_rate)
     predicted = replace(_kicked(particles, start, time_step), position=position)
     predicted, kicked = dynamics.settle(predicted, _kicked(particles, start, 0.5 * time_step))
@@ -132,12 +136,12 @@ def _kick_drift_kick(dynamics: ParticleDynamics, particles: ParticleSet, start: 
 
 
 def _remembered(rates: Rates) -> dict[str, Tensor]:
-    """The rates that a later step may need, by name."""
+    """Return the rates that a later step may need, by name."""
     return {name: getattr(rates, name) for name in (*BY_PARTICLE, "density") if getattr(rates, name) is not None}
 
 
 def _kicked(particles: ParticleSet, rates: Rates, time_step: float) -> ParticleSet:
-    """Particles after an Euler step of velocity and density; a density that terms give replaces the old one."""
+    """Return particles after an Euler step of velocity and density. A density that terms give replaces the old one."""
     density = particles.density
     if rates.density is not None:
         density = rates.density
@@ -147,7 +151,7 @@ def _kicked(particles: ParticleSet, rates: Rates, time_step: float) -> ParticleS
 
 
 def _advanced(particles: ParticleSet, stage: ParticleSet, rates: Rates, time_step: float) -> ParticleSet:
-    """Particles after an Euler step of all columns, with the velocity and the rates of a stage."""
+    """Return `particles` after an Euler step of all columns, with the velocity of `stage` and its `rates`."""
     return replace(_kicked(particles, rates, time_step), position=particles.position + time_step * _pace(stage, rates))
 
 

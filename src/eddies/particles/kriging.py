@@ -30,11 +30,11 @@ LEAST_WEIGHT = 0.01
 
 
 def covariance(filter_width: float) -> tuple[float, np.ndarray]:
-    """Rate b and amplitudes a (m,) of the covariance C(r) = sum_m a_m exp(-b 2^m r^2), C(0) = 1.
+    """Return b and the amplitudes a (SCALES,) of the covariance C(r) = sum_m a_m exp(-b 2^m r^2), with C(0) = 1.
 
-    C belongs to a velocity with E(k) ~ k^(-5/3) after a Gaussian filter of width d. A spectrum k^(-5/3) is a sum of
-    Gaussians of lengths l with weights l^(2/3). After the filter no Gaussian is narrower than d/sqrt(6), since
-    E G^2 ~ exp(-k^2 d^2/12).
+    C belongs to a velocity with E(k) ~ k^(-5/3) after a Gaussian filter of width d. A covariance with this spectrum is
+    a sum of Gaussians of lengths l with weights l^(2/3). The filter multiplies the spectrum by exp(-k^2 d^2/12), so no
+    Gaussian is then narrower than d/sqrt(6).
     """
     squares = [filter_width**2 / 6 * NARROWEST * 2.0**m for m in reversed(range(SCALES))]
     weights = [square ** (1 / 3) for square in squares]
@@ -42,11 +42,12 @@ def covariance(filter_width: float) -> tuple[float, np.ndarray]:
 
 
 def interpolated(pairs: Pairs, support: float, filter_width: float, values: Tensor) -> tuple[Tensor, Tensor]:
-    """Kriging at points that are not particles: field (n, c) and gradient (n, c, 3) from the particles' values (s, c).
+    """Interpolate a field (n, c) and its gradient (n, c, 3) by kriging, at points x that are not particles.
 
-    Both are sums sum_j w_j f_j with the weights w = K^-1 b of `kriging_weights`. For the field b_j is C(|x - x_j|). For
-    the gradient b_j is the derivative of C(|x - x_j|) with respect to the point x. The weights of the field add up to
-    one and those of the gradient to zero, so a constant is exact. The result is NaN where the equations cannot be
+    `values` (s, c) holds f_j of each particle j that the rank sees. Both results are sums sum_j w_j f_j with weights
+    w = K^-1 b of `kriging_weights`. For the field b_j is C(|x - x_j|). For the gradient b_j is the derivative of
+    C(|x - x_j|) with respect to the point x. The weights of the field add up to one and those of the gradient to zero,
+    so a constant field is exact. The result is NaN where the equations cannot be
     solved, and zero where no particle lies within the support.
     """
     _, weights = kriging_weights(pairs, support, filter_width, sited=False)
@@ -58,15 +59,15 @@ def interpolated(pairs: Pairs, support: float, filter_width: float, values: Tens
 
 def kriging_weights(pairs: Pairs, support: float, filter_width: float,
                     sited: bool = True) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Kriging weights: the best linear estimate sum_j w_j f_j of a field and its derivatives, w = K^-1 b.
+    """Return the weights w of the best linear estimate sum_j w_j f_j of a field or of a derivative: w = K^-1 b.
 
     K_jk is C(|x_j - x_k|) (see `covariance`), plus NOISE / max(1 - (r/support)^4, 1e-4) on the diagonal. This noise
     of a particle grows with its distance r from the receiver, so neighbours enter and leave the support without a jump.
     If the receiver x is a particle i (`sited`), its own value f_i is among the f_j. For the field, b is then 1 for the
     particle and 0 for its neighbours. The sum is then w_i times the difference between f_i and the neighbours'
     estimate. For derivatives, b is the derivative of C(|x - x_j|) with respect to x. The mean of f is unknown. So a
-    multiple of K^-1 1 is subtracted to make the sum of the weights zero. For the field at a receiver that is no
-    particle, the weights add up to one instead (ordinary kriging).
+    multiple of K^-1 1 is subtracted from w to make the sum of the weights zero. For the field at a receiver that is
+    no particle, the weights add up to one instead (ordinary kriging).
 
     Returns
     -------
@@ -100,7 +101,7 @@ class Kriging:
         self._seen, self._filter_width, self._with_ghosts = seen, filter_width, with_ghosts
 
     def derivatives(self, field: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Residual (n, c), first (n, c, 3) and second (n, c, 3, 3) derivatives of fields (n, c).
+        """Return the residual (n, c), the first (n, c, 3) and the second (n, c, 3, 3) derivatives of fields (n, c).
 
         The residual is the field minus the neighbours' estimate of it; it is zero without neighbours.
         """
@@ -110,7 +111,7 @@ class Kriging:
         return residual, rows[..., FIRST], rows[..., SECOND][..., PLACES]
 
     def gradient(self, field: Tensor) -> Tensor:
-        """Gradient (n, 3) of a field (n,)."""
+        """Return the gradient (n, 3) of a field (n,)."""
         return self._estimate(self._own[FIRST], self._others[FIRST], field[:, None])[:, 0]
 
     def laplacian(self, field: Tensor) -> Tensor:
@@ -119,7 +120,7 @@ class Kriging:
 
     @cached_property
     def laplacian_bound(self) -> Tensor:
-        """Sum of the magnitudes of the Laplacian's weights, (n,); at least 1/d^2, also without neighbours."""
+        """Sum (n,) of the magnitudes of the weights of the Laplacian, or 1/d^2 if the sum is smaller."""
         own, others = self._laplacian
         sizes = own.abs() + torch.segment_reduce(others.abs(), "sum", offsets=self._offsets)
         return sizes.clamp_min(self._filter_width**-2)
@@ -131,7 +132,7 @@ class Kriging:
                 self._others[xx] + self._others[yy] + self._others[zz])
 
     def _estimate(self, own: Tensor, others: Sequence[Tensor], field: Tensor) -> Tensor:
-        """Sums own_i f_i + sum_j others_ij f_j for rows of weights and fields (n, c): (n, c, rows)."""
+        """Return own_i f_i + sum_j others_ij f_j for fields f (n, c) and each row of the weights: (n, c, rows)."""
         seen = self._with_ghosts(field.to(own.dtype)).cpu()
         assert len(seen) == self._seen, "the weights belong to another halo or neighbour list"
         if torch.is_grad_enabled() and seen.requires_grad:

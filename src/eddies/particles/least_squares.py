@@ -1,4 +1,4 @@
-"""Regularised least squares for the solenoidal modes of a velocity known at points."""
+"""Regularised least squares for the solenoidal modes of a velocity that is known at points."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ SMOOTHING = 5.0
 
 @dataclass(frozen=True)
 class Solution:
-    """Result of a solve.
+    """Result of `LeastSquares.solve`.
 
     Parameters
     ----------
     modes : (3, kz, ky, kx), the solution.
-    at_points : values (n, 3) of the modes at the points.
-    iterations, left : number of iterations, and remaining squared residual.
+    at_points : (n, 3), values of the solution at the points.
+    iterations : number of iterations.
+    left : squared residual that remains, as in `LeastSquares.size`.
     """
 
     modes: Tensor
@@ -39,8 +40,8 @@ class LeastSquares:
 
         sum_i |v_i - u(x_i)|^2 + sum_k penalty_k |u(k)|^2
 
-    over solenoidal modes u (3, kz, ky, kx). B evaluates modes at points. P projects onto the solenoidal modes that are
-    solved for.
+    over solenoidal modes u (3, kz, ky, kx), for velocities v_i known at points x_i. B evaluates modes at the points.
+    P projects onto the solenoidal modes that are solved for.
 
     Parameters
     ----------
@@ -56,13 +57,13 @@ class LeastSquares:
                                   scale.numpy(), self.penalty.numpy())
 
     def gathered(self, values: Tensor, points: Points) -> Tensor:
-        """P B^T of values (n, 3) at points; collective, differentiable."""
+        """Return P B^T applied to values (n, 3) at points; collective, differentiable."""
         return self.projected(self.grid.spread(values, points) * self.grid.spectral.cells**3)
 
     def descent(self, missing: Tensor, points: Points, modes: Tensor) -> Tensor:
-        """Half the negative gradient of the minimised sum at modes u: P B^T (v - B u) - penalty u.
+        """Return half the negative gradient of the minimised sum at `modes` u: P B^T (v - B u) - penalty u.
 
-        `missing` is v - B u (n, 3). The result vanishes at the minimum. Collective, differentiable.
+        `missing` (n, 3) is v - B u. The result vanishes at the minimum. Collective, differentiable.
         """
         if torch.is_grad_enabled():
             return self.gathered(missing, points) - self.penalty * modes
@@ -70,7 +71,7 @@ class LeastSquares:
         return torch.from_numpy(self._passes.apply(spread.numpy(), -modes.numpy())[0])
 
     def projected(self, modes: Tensor) -> Tensor:
-        """Projection P of modes; differentiable."""
+        """Return P applied to modes; differentiable."""
         return self.grid.solenoidal(modes) * self._inside
 
     def preconditioner(self, count: float) -> Tensor:
@@ -78,9 +79,9 @@ class LeastSquares:
         return torch.where(self.inside, 1 / (count + SMOOTHING * self.penalty), 0.0)
 
     def size(self, residual: Tensor, count: float) -> float:
-        """Squared norm of a residual on all ranks, with the preconditioner as weight; collective.
+        """Return the squared norm of a residual (3, kz, ky, kx) over all ranks; collective.
 
-        The result is comparable to sum_i |v_i|^2.
+        The preconditioner for `count` points is the weight, so the result is comparable to sum_i |v_i|^2.
         """
         square = residual.real.square() + residual.imag.square()
         weighted = self.grid.multiplicity * self.preconditioner(count) * square
@@ -89,7 +90,7 @@ class LeastSquares:
     @torch.no_grad()
     def solve(self, points: Points, right: Tensor, count: float, enough: float, iterations: int | None,
               most: int) -> Solution:
-        """Solve A y = `right` by preconditioned conjugate gradients; collective.
+        """Solve A y = `right` by preconditioned conjugate gradients, for `count` points over all ranks; collective.
 
         The iteration ends when the squared residual (`size`) is at most `enough`, or after `most` iterations. If
         `iterations` is given, the solve takes this number of iterations instead.

@@ -31,25 +31,27 @@ TERMS: dict[str, type[Term]] = {
     if isinstance(kind, type) and issubclass(kind, Term) and kind.Settings.word}
 # Name of the forcing among the terms of a model.
 FORCING = "injection"
-# What a term must declare in `gives` to return each rate. Pressure modes are ignored unless a term reads the density.
+# By name of a rate: the word that `gives` must contain in the settings of a term that returns this rate. Modes of a
+# pressure need no word; they have an effect only if `LagrangianModel.density_is_given`.
 GIVES_OF = {"acceleration": "acceleration", "force_modes": "acceleration", "density": "density",
             "density_rate": "density_rate", "shift_velocity": "shift_velocity", "shift_acceleration": "shift_velocity"}
-# Largest number of particles of a rank in the check of parameters: a gradient through all pairs takes much memory.
+# Largest number of particles of a rank for which `check_terms` computes gradients with respect to parameters. Gradients
+# through all pairs would take much memory.
 CHECKED = 64
-# The rates that a linear term stores.
+# The rates that LinearRates holds.
 STORED = (*BY_PARTICLE, "density")
 
 
 class LagrangianModel(nn.Module):
-    """dv_i/dt, and d rho_i/dt if some term gives it, as the sum of terms.
+    """The rates of change of the particles i as sums of terms: dv_i/dt, and d rho_i/dt if some term gives it.
 
-    Terms that do not read the density are evaluated first, because they may give the density that the others read.
+    Terms that do not read the density are evaluated first, because they may give the density that other terms read.
     Inputs that no term reads are not computed. Raises TermError if a term both reads and gives the density.
 
     Parameters
     ----------
-    terms : by name, in the order of evaluation.
-    flow : the flow that the terms were made for, and the units of their rates.
+    terms : the terms by name. Apart from the rule above, they are evaluated in this order.
+    flow : scales of the flow that the terms were made for.
     """
 
     def __init__(self, terms: Mapping[str, Term], flow: FlowUnits) -> None:
@@ -61,7 +63,7 @@ class LagrangianModel(nn.Module):
                 raise TermError(f'term "{name}": both reads and gives the density; it can do only one of the two')
 
     def forced(self, settings: TermSettings | None) -> LagrangianModel:
-        """Model of the same terms (not copies) plus a forcing with these settings; this model if `settings` is None."""
+        """Return a model of the same terms (not copies) and a forcing with `settings`; this model if they are None."""
         if settings is None:
             return self
         return LagrangianModel({**self.terms, FORCING: Forcing(settings, self.flow)}, self.flow)
@@ -86,7 +88,7 @@ class LagrangianModel(nn.Module):
 
     @property
     def density_is_given(self) -> bool:
-        """Whether some terms give the density itself, not its rate, and others read it."""
+        """Whether some terms give the density itself, not its rate, and other terms read it."""
         return self.reads_density and "density" in self.gives
 
     @property
@@ -101,19 +103,19 @@ class LagrangianModel(nn.Module):
 
     @property
     def regresses_density(self) -> bool:
-        """Whether a density rate is learned from the rates at single moments alone, not through several steps."""
+        """Whether a density rate is learned from known rates at single moments alone, without runs of several steps."""
         through_horizons = any("density_rate" in term.settings.gives and term.settings.learns_through_horizons
                                for term in self.terms.values())
         return self.learns_density and not through_horizons
 
     @property
     def networks(self) -> list[PairTerm]:
-        """The terms with a network of pairs. Their method `features` returns the inputs of the network."""
+        """The terms that evaluate a neural network for each pair. Their method `features` returns the inputs."""
         return [term for term in self.terms.values() if isinstance(term, PairTerm) and hasattr(term, "features")]
 
     @property
     def learned_coefficients(self) -> dict[str, list[dict[str, Any]]]:
-        """Learned coefficients by name of the term, ready for JSON; see `Coefficient`."""
+        """Fields of each learned `Coefficient`, ready for JSON, by name of the term. Terms without any are left out."""
         found = {}
         for name, term in self.terms.items():
             with users_code(type(term), TermError):
@@ -121,12 +123,12 @@ class LagrangianModel(nn.Module):
         return {name: coefficients for name, coefficients in found.items() if coefficients}
 
     def rates(self, context: Context, kept: Mapping[str, LinearRates] | None = None) -> Rates:
-        """Sum of the terms; differentiable, collective.
+        """Return the rates of the k particles `context.rows`, the sums of all terms; differentiable, collective.
 
-        The result has the `acceleration` (k, 3) of the k requested particles, which includes the force of
-        `force_modes`. It has `density_rate` (k,), `shift_velocity` and `shift_acceleration` if a term gives them. A
-        `density` that terms give is the whole density (n,), not its deviation. `kept` holds results of
-        `linear_rates` by name of the term; each replaces the evaluation of that term.
+        The result always has an `acceleration` (k, 3), which includes the interpolated `force_modes` of the terms. It
+        has `density_rate` (k,), `shift_velocity` (k, 3) and `shift_acceleration` (k, 3) if a term gives them. If
+        `density_is_given`, it has the `density` (n,) of all n owned particles, not its deviation from the mean. `kept`
+        holds results of `linear_rates` by name of the term; each replaces the evaluation of that term.
         """
         kept, sums = kept or {}, []
         for stage in self._stages if self.density_is_given and context.density is None else [list(self.terms.items())]:
@@ -145,15 +147,15 @@ class LagrangianModel(nn.Module):
 
     @torch.no_grad()
     def linear_rates(self, context: Context) -> dict[str, LinearRates]:
-        """Rates of each linear term as a function of its parameters, by name of the term; collective.
+        """Return the rates of each linear term as a function of its parameters, by name of the term; collective.
 
-        Terms that read a density given by others are left out. Training stores the result for a frame.
+        Terms that read a density are left out if other terms give it. Training stores the result for each frame.
         """
         terms = self._stages[0] if self.density_is_given else self.terms.items()
         return {name: self._linear_rates(term, context) for name, term in terms if term.linear}
 
     def check_terms(self, context: Context) -> None:
-        """Raise TermError for a fault of a term that the shapes of its rates do not show; collective.
+        """Raise TermError if a term has a fault that the shapes of its rates do not show; collective.
 
         Such faults are rates that are not finite, a change of the particles in place, a parameter without an effect on
         the rates, and a term that declares itself linear and is not.
@@ -196,7 +198,7 @@ class LagrangianModel(nn.Module):
     def require_linear(self, context: Context) -> None:
         """Raise TermError if a term declares itself linear and is not; collective.
 
-        The test uses parameters other than the stored ones."""
+        The function that `linear_rates` finds is compared with the term at other parameters."""
         for name, kept in self.linear_rates(context).items():
             term = self.terms[name]
             others = [torch.linspace(0.3, 1.9, parameter.numel()).reshape(parameter.shape).to(parameter)
@@ -220,10 +222,10 @@ class LagrangianModel(nn.Module):
         return stages
 
     def _at_particles(self, rates: Rates, context: Context) -> Rates:
-        """Rates with their modes interpolated to the particles.
+        """Return the rates with their modes interpolated to the particles.
 
-        The mean of the force over the particles is subtracted, so their momentum is conserved. The mean vanishes in
-        continuous space, but not if particles sample the grid unevenly.
+        The mean over the particles of the interpolated force is subtracted, so the momentum is conserved. The mean of
+        the force over space is zero, but particles do not sample space evenly.
         """
         pressure = rates.pressure_modes if self.density_is_given else None
         modes = [part for part in (rates.force_modes, None if pressure is None else pressure[None]) if part is not None]
@@ -239,7 +241,7 @@ class LagrangianModel(nn.Module):
         return total(parts)
 
     def _with_parameters(self, term: Term, context: Context, values: Sequence[Tensor]) -> Rates:
-        """Rates of a term at the particles with other values of its parameters."""
+        """Return the rates of a term at the particles, with `values` in place of its parameters."""
         context.forget_sums(term)
         named = {name: value for (name, _), value in zip(term.named_parameters(), values)}
         rates = _checked(term, context, lambda: functional_call(term, named, (context,)))
@@ -279,7 +281,7 @@ class LinearRates:
     parameters: Sequence[Tensor]
 
     def at(self, rows: Tensor | None) -> Rates:
-        """The rates of the particles `rows` (k,), or of all particles; differentiable in the parameters.
+        """Return the rates of the particles `rows` (k,), of all if it is None; differentiable in the parameters.
 
         The density is always given for all particles.
         """
@@ -298,7 +300,8 @@ class LinearRates:
 
 
 def _everywhere(term: Term) -> bool:
-    """Whether a term is needed at all particles: it is a sum over pairs, and other terms read the density it gives."""
+    """Whether a term is evaluated at all owned particles: it is a sum over pairs and gives a density, which other terms
+    may read."""
     return isinstance(term, PairTerm) and "density" in term.settings.gives
 
 
@@ -309,8 +312,8 @@ def _evaluated(term: Term, context: Context) -> Rates:
 
 
 def _checked(term: Term, context: Context, evaluate: Callable[[], object]) -> Rates:
-    """The rates that a term gives. Raises TermError, with the name of the term's class, if the term fails or does not
-    return Rates of the declared kinds with one row for each particle."""
+    """Return the rates of a term, the result of `evaluate`. Raises TermError, with the name of the term's class, if
+    the term fails or does not return Rates of the declared kinds with one row for each particle."""
     name, gives = type(term).__name__, term.settings.gives
     with users_code(type(term), TermError):
         result = evaluate()
@@ -339,10 +342,11 @@ def _checked(term: Term, context: Context, evaluate: Callable[[], object]) -> Ra
 
 
 def build_model(settings: Mapping[str, TermSettings], paths: Iterable[str], flow: FlowUnits) -> LagrangianModel:
-    """Model with initial parameters in double precision. `paths` are the words or import paths of its terms.
+    """Make a model with initial parameters in double precision.
 
-    Raises ImportPathError if an import path leads to nothing, and TermError if it leads to no Term or the term cannot
-    be made.
+    `paths` are the words or import paths of its terms, and `settings` holds the settings of each by its short name.
+    Raises ImportPathError if an import path leads to nothing. Raises TermError if it leads to something that is not a
+    Term, or if the term cannot be made.
     """
     terms = {short_name(path): _build_term(path, settings[short_name(path)], flow) for path in paths}
     return LagrangianModel(terms, flow)

@@ -16,7 +16,7 @@ from eddies.particles.rates import Rates
 
 @dataclass(frozen=True)
 class Moment:
-    """The particles at a moment, divided among the ranks in blocks by id: the block of this rank.
+    """This rank's block of the particles at a moment.
 
     A block holds particles with consecutive ids, in order of id. They may lie in any slab.
 
@@ -25,8 +25,8 @@ class Moment:
     time : time of the moment.
     first : first id of the block.
     position, velocity, acceleration : (n, 3); acceleration is the rate of change of the velocity.
-    density, density_rate : (n,), if particles have a density, else None.
-    shift : (n, 3), velocity of the particles relative to the fluid, if there is one, else None.
+    density, density_rate : (n,); None if the particles have no density.
+    shift : (n, 3), velocity of the particles relative to the fluid; None if they move with the fluid.
     """
 
     time: float
@@ -40,7 +40,7 @@ class Moment:
 
     @classmethod
     def of(cls, comm: Comm, total: int, time: float, particles: ParticleSet, rates: Rates) -> Moment:
-        """Make a moment from particles on any ranks; `total` is their number over all ranks. Collective."""
+        """Make a moment from the particles of each rank; `total` is their number over all ranks. Collective."""
         order = IdOrder(comm, as_numpy(particles.id), total)
         columns = {"position": particles.position, "velocity": particles.velocity, "acceleration": rates.velocity_rate,
                    "density": particles.density, "density_rate": rates.density_rate, "shift": rates.shift_velocity}
@@ -51,10 +51,11 @@ class Moment:
 
 
 def between(before: Moment, after: Moment, time: float, box: PeriodicBox) -> ParticleSet:
-    """Interpolate the particles to a time between two moments, in blocks by id.
+    """Interpolate the particles of this rank's block to `time`, which lies between two moments.
 
-    Hermite polynomials, of fifth degree for positions and of third for velocities and densities, match values and rates
-    at both ends. Their errors are of sixth and fourth order in the interval.
+    Each position follows a Hermite polynomial of fifth degree, which matches position, velocity and acceleration at
+    both moments. Its error is of sixth order in the interval. Velocities and densities follow polynomials of third
+    degree, which match values and rates of change. Their errors are of fourth order.
     """
     step = after.time - before.time
     theta = (time - before.time) / step
@@ -80,6 +81,7 @@ def between(before: Moment, after: Moment, time: float, box: PeriodicBox) -> Par
 
 
 def _cubic(first: np.ndarray, last: np.ndarray, rise: np.ndarray, fall: np.ndarray, theta: float) -> np.ndarray:
-    """Hermite's polynomial of third degree at 0 <= theta <= 1, from values and slopes at both ends."""
+    """Value at 0 <= theta <= 1 of the cubic polynomial with the values `first` and `last` at 0 and 1, and the slopes
+    `rise` and `fall` there."""
     jump, turn = last - first - rise, fall - rise
     return first + theta * (rise + theta * (3 * jump - turn + theta * (turn - 2 * jump)))

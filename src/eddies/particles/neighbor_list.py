@@ -19,7 +19,7 @@ class NeighborList:
     """All senders within `cutoff` + `skin` of each receiver.
 
     The list is in compressed rows: the senders of receiver i are `senders[offsets[i]:offsets[i + 1]]`. If i and j are
-    both receivers and senders, the list holds (i, j) and (j, i) or neither.
+    both receivers and senders, the list holds both (i, j) and (j, i), or neither.
 
     Parameters
     ----------
@@ -27,8 +27,8 @@ class NeighborList:
     cutoff : radius within which pairs interact.
     skin : extra radius. The list remains valid until a particle has moved by `skin`/2.
 
-    Raises ValueError unless `cutoff` is positive, `skin` is not negative, and their sum is less than half the box.
-    Nearest images are unique within this distance.
+    Raises ValueError unless `cutoff` is positive, `skin` is not negative, and their sum is less than half the box. Only
+    within half the box are nearest images unique.
     """
 
     def __init__(self, box: PeriodicBox, cutoff: float, skin: float) -> None:
@@ -45,7 +45,7 @@ class NeighborList:
         """
         if not (torch.isfinite(receivers).all() and torch.isfinite(senders).all()):
             raise ValueError("neighbour list: a position is not finite")
-        # The radius is slightly larger, so only `pairs` decides which pairs count, alike for (i, j) and (j, i).
+        # The radius is slightly larger, so that `pairs` alone decides which pairs count: alike for (i, j) and (j, i).
         reach = (self.cutoff + self.skin) * (1 + 1e-9)
         columns = neighbors_within(self.box, reach, as_numpy(receivers), as_numpy(senders), exclude_self)
         self.offsets, self.senders = (torch.from_numpy(column).to(receivers.device) for column in columns)

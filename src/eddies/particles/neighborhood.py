@@ -85,7 +85,7 @@ class Neighborhood:
         self.forget()
 
     def forget(self) -> None:
-        """Rebuild halo and list at the next update."""
+        """Make the next update rebuild halo and list."""
         self._ids: Tensor | None = None
 
     def built_at(self, particles: ParticleSet) -> Tensor | None:
@@ -93,8 +93,10 @@ class Neighborhood:
         return self._built_at if particles.id is self._ids else None
 
     def outdated(self, particles: ParticleSet) -> bool:
-        """Whether, on any rank, the last build was for other particles, or a particle has moved since by more than half
-        the skin, or has a position of NaN."""
+        """Whether halo and list must be built again. All ranks get the same answer.
+
+        This is so if, on any rank, the last build was for other particles, a particle has moved since by more than half
+        the skin, or a position is NaN."""
         distance = math.inf
         if particles.id is self._ids:
             moved = self.box.displacement(particles.position.detach(), self._built_at)
@@ -134,9 +136,9 @@ class Neighborhood:
 
 
 def farthest_outside(slab: SlabDecomposition, particles: ParticleSet) -> float:
-    """Largest distance of a particle of any rank from its slab; collective.
+    """Return the largest distance of any particle of any rank from the slab of its rank; collective.
 
-    Raises HaloError on all ranks if it exceeds the length of the box or a position is not finite.
+    Raises HaloError on all ranks if the distance exceeds the length of the box or a position is not finite.
     """
     position = particles.position.detach()
     z = position[:, 2]

@@ -69,8 +69,9 @@ def gather_rows(column: Tensor, index: Tensor) -> Tensor:
 
 
 class _SegmentSum(torch.autograd.Function):
-    """Sums of the columns of a (components, m) array within each segment. Segment i has the columns offsets[i], ...,
-    offsets[i + 1] - 1. On a CPU numpy's sum is the fastest."""
+    """Sums of the columns of a (components, m) array within each segment.
+
+    Segment i has the columns offsets[i], ..., offsets[i + 1] - 1. On a CPU numpy's sum is the fastest."""
 
     @staticmethod
     def forward(ctx, values: Tensor, offsets: Tensor, segment: Tensor) -> Tensor:
@@ -94,13 +95,14 @@ class _SegmentSum(torch.autograd.Function):
 class ScaledPairs:
     """Pairs (i, j) and their quantities in the units of a model, each computed at first use.
 
-    x = (x_i - x_j)/d (3, m), v = (v_i - v_j)/v_rms (3, m) and rho' = (rho - rho_0)/rho_rms, with the filter width d.
+    These are x = (x_i - x_j)/d (3, m), v = (v_i - v_j)/v_rms (3, m) and rho' = (rho - rho_0)/rho_rms. d is the filter
+    width, rho_0 the mean density, and v_rms and rho_rms are the scales of velocity and density in ReferenceScales.
 
     Parameters
     ----------
     pairs : in the units of the simulation.
     column : returns the column "velocity" or "density" (s, ...) of the particles that this rank sees.
-    flow : the units, and the radius of interaction.
+    flow : has the units and the radius of interaction.
     """
 
     def __init__(self, pairs: Pairs, column: Callable[[str], Tensor], flow: FlowUnits) -> None:
@@ -122,7 +124,7 @@ class ScaledPairs:
 
     @cached_property
     def densities(self) -> tuple[Tensor, Tensor]:
-        """rho'_i and rho'_j (m,)."""
+        """rho'_i and rho'_j of each pair, each (m,)."""
         scales, density = self.flow.scales, self.column("density")
         own, other = (((column - scales.density_mean) / scales.density).to(self.pairs.displacement)
                       for column in (self.pairs.at_receivers(density), self.pairs.at_senders(density)))
@@ -140,11 +142,11 @@ class ScaledPairs:
 
     @cached_property
     def weight(self) -> Tensor:
-        """w = (1 - q^2)^2 (m,), q the distance over the radius of interaction."""
+        """w = (1 - q^2)^2 (m,), where q is the distance divided by the radius of interaction."""
         return moments.weight(self.pairs.distance, self.flow.cutoff)
 
     def invariants(self, names: Sequence[str], symmetric: bool) -> Tensor:
-        """The inputs `names` of a network for each pair, (features, m), in the order of `eddies.scene.terms.INPUTS`.
+        """Return the inputs `names` of a network for each pair, (features, m), in the order of `scene.terms.INPUTS`.
 
         "density" gives two features: rho'_i and rho'_j, or, if `symmetric`, rho'_i + rho'_j and (rho'_i - rho'_j)^2.
         The symmetric features are equal for (i, j) and (j, i). All other features are always symmetric.
@@ -169,7 +171,7 @@ class CompiledSum:
     Parameters
     ----------
     kind, numbers : name and constants of the sum in the library (kernels/summands.hpp).
-    parameters : (p,), differentiable; none by default.
+    parameters : (p,), parameters of the sum, differentiable; none by default.
     scalars : columns (s,) of all particles that this rank sees, differentiable.
     reads_velocity : whether the sum needs the velocities of the particles.
     """
@@ -183,10 +185,11 @@ class CompiledSum:
 
 def compiled_sums(space: PairSpace, summands: Sequence[CompiledSum], parities: Sequence[Tensor], position: Tensor,
                   velocity: Tensor | None, wanted: np.ndarray, dtype: torch.dtype) -> tuple[Tensor, ...]:
-    """Sums (components, s) of each summand over the neighbours of the particles `wanted`, bool (s,); differentiable.
+    """Return the sums (components, s) of each summand over the neighbours of the particles `wanted`, bool (s,).
 
     The sums of other particles are undefined. `parities` are the `parity` of each PairSum. `position` and `velocity`
-    (s, 3) belong to all particles that this rank sees. Raises ValueError if a position is not finite.
+    (s, 3) belong to all particles that this rank sees. `dtype` is the precision of the arithmetic. Differentiable.
+    Raises ValueError if a position is not finite.
     """
     columns: list[Tensor] = []
     placed = []
@@ -205,7 +208,7 @@ def compiled_sums(space: PairSpace, summands: Sequence[CompiledSum], parities: S
 
 
 class _PairSums(torch.autograd.Function):
-    """The compiled sums. The backward pass evaluates all pairs again."""
+    """The sums of `compiled_sums`, by the compiled library. The backward pass evaluates all pairs again."""
 
     @staticmethod
     def forward(ctx, space: PairSpace, summands: list[Summand], wanted: np.ndarray, dtype: torch.dtype,

@@ -21,10 +21,10 @@ from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.reconstruction import normalisation, reconstruct_with_gradient
 from eddies.particles.smoothing_kernels import HermiteKernel, SmoothingKernel
 
-# Number of pairs evaluated together where no gradient is recorded: they fill about the cache of a core.
+# Number of pairs evaluated together where no gradient is recorded. Their values about fill the cache of a core.
 PAIRS_TOGETHER = 1 << 16
-# Number of pairs evaluated together in kriging, with ten weights per pair. They belong to enough receivers for all
-# threads.
+# Number of pairs evaluated together in kriging, which has ten weights per pair. So many pairs belong to enough points
+# to occupy all threads.
 KRIGED_TOGETHER = 1 << 20
 # Ridge of moving least squares. Smaller values do not change the errors of a filtered field. Where particles gather
 # because no force acts on them, the ridge bounds the gradients.
@@ -34,15 +34,15 @@ RIDGE = 1e-4
 class ParticleField:
     """This rank's particles, the ghosts within `support` of its slab, and the grid points in the slab, on the host.
 
-    Along each axis the grid has one cell for each plane of the slabs. Its points on this rank are numbered in the order
-    z, y, x, with x fastest.
+    Along each axis the grid has as many cells as all slabs together have planes. The grid points of this rank are
+    numbered with x fastest and z slowest.
 
     Parameters
     ----------
     decomposition : slabs that hold the particles.
     support : largest radius of the kernels to be used.
     position, velocity : (n, 3), owned particles.
-    dtype : type of the pair arithmetic.
+    dtype : floating-point type of computations with pairs.
     """
 
     def __init__(self, decomposition: SlabDecomposition, support: float, position: Tensor, velocity: Tensor,
@@ -58,7 +58,7 @@ class ParticleField:
 
     @torch.no_grad()
     def volumes(self, kernel: SmoothingKernel) -> Tensor:
-        """Volumes (s,) of all local particles; collective.
+        """Return the volumes (s,) of all owned particles and ghosts; collective.
 
         The volume of particle i is 1 / sum_j W(x_i - x_j), including j = i. A kernel with a mean volume gives this
         volume to all particles. The result is kept until another kernel is given.
@@ -71,10 +71,10 @@ class ParticleField:
         return self._latest[1]
 
     def volumes_by_table(self, kernel: HermiteKernel) -> Tensor:
-        """Volumes of all local particles (s,) for a tabulated kernel; collective, differentiable.
+        """Return the same as `volumes`, for a tabulated kernel; collective, differentiable in the table.
 
-        The method stores the contribution of each table entry to each particle's sum, 8 bytes for each knot and
-        particle. So it is fast for many tables one after the other, as in training.
+        The method stores the factor of each table entry in each particle's sum of W: 8 bytes for each knot and
+        particle. So it is fast if it is called with many tables of the same size, as in training.
         """
         if kernel.mean_volume is not None:
             return self.volumes(kernel)
@@ -87,15 +87,20 @@ class ParticleField:
         return with_ghosts(self.halo, 1 / (self._entries @ kernel.table))
 
     def on_grid(self, kernel: SmoothingKernel, volume: Tensor, rows: Tensor | slice) -> tuple[Tensor, Tensor]:
-        """Average velocity (k, 3) and its gradient (k, 3, 3) at the grid points `rows` of this rank; differentiable."""
+        """Return the average velocity (k, 3) and its gradient (k, 3, 3) at the grid points `rows` of this rank.
+
+        `volume` (s,) is the result of `volumes`. Differentiable in the kernel and the volumes.
+        """
         pairs = self._around.pairs(self.points, self._position, rows, self.dtype)
         return reconstruct_with_gradient(kernel, pairs, volume, self._velocity)
 
-    # ---- methods that record no gradient, by the compiled library
+    # ---- methods of the compiled library, which record no gradient
 
     @torch.no_grad()
     def averaged(self, kernel: SmoothingKernel, receivers: Tensor) -> tuple[Tensor, Tensor]:
-        """Average velocity (k, 3) and gradient (k, 3, 3) [component, direction] at any points of this rank; collective.
+        """Return the average velocity (k, 3) at any points of this rank, and its gradient (k, 3, 3); collective.
+
+        The gradient has the axes [point, component, direction].
         """
         columns = torch.cat([self.volumes(kernel).unsqueeze(1), self._velocity], dim=1)
         columns = torch.cat([columns.new_zeros(len(receivers), 4), columns])
@@ -108,7 +113,7 @@ class ParticleField:
 
     @torch.no_grad()
     def averaged_on_grid(self, kernel: SmoothingKernel) -> Tensor:
-        """Average velocity (m, 3) at all of this rank's grid points; collective. It costs less than `averaged`."""
+        """Return the average velocity (m, 3) at all of this rank's grid points; collective. Faster than `averaged`."""
         slab, volume = self.decomposition, self.volumes(kernel)
         weighted = volume.unsqueeze(1) * torch.cat([torch.ones_like(volume).unsqueeze(1), self._velocity], dim=1)
         sums = torch.from_numpy(sums_on_grid(self._box, slab.planes, range(slab.start, slab.stop), _for_library(kernel),
@@ -118,15 +123,16 @@ class ParticleField:
     @torch.no_grad()
     def fitted(self, kernel: SmoothingKernel, degree: int, mean_volume: float,
                receivers: Tensor) -> tuple[Tensor, Tensor]:
-        """Velocity (k, 3) and gradient (k, 3, 3) by moving least squares at any points x of this rank.
+        """Fit the velocity (k, 3) and its gradient (k, 3, 3) by moving least squares at any points x of this rank.
 
-        The fit of each component A is the polynomial p of this degree, 1 or 2, in (x_j - x)/h that minimises
+        The result for each component A is the value and gradient at x of a polynomial p of this degree, 1 or 2, in
+        (x_j - x)/h. h is the support of the kernel W, which must not be negative. p minimises
 
-            V sum_j W(x - x_j) |p(x_j) - A_j|^2 + RIDGE (sum of the squares of all coefficients except the constant)
+            V sum_j W(x - x_j) |p(x_j) - A_j|^2 + RIDGE (sum of the squares of all coefficients except the constant).
 
-        with V the `mean_volume` of a particle, so that V sum_j W is one on average. W must not be negative. Where
-        neighbours are few, distant or badly placed, the ridge dominates and the result is close to the average with the
-        weight W. It is zero where no particle lies within the support.
+        V is the `mean_volume` of a particle, so V sum_j W is one on average. Where neighbours are few, distant or badly
+        placed, the ridge dominates, and the result is close to the average with the weight W. It is zero where no
+        particle lies within the support.
         """
         neighbors = self._neighbors_of(receivers)
         values = fitted(self._box, degree, _for_library(kernel), mean_volume, RIDGE, neighbors.offsets.numpy(),
@@ -136,8 +142,10 @@ class ParticleField:
 
     @torch.no_grad()
     def kriged(self, filter_width: float, receivers: Tensor) -> tuple[Tensor, Tensor]:
-        """Velocity (k, 3) and gradient (k, 3, 3) by kriging with all neighbours within the support; see
-        `interpolated`."""
+        """Interpolate the velocity (k, 3) and its gradient (k, 3, 3) by kriging with all neighbours within `support`.
+
+        `eddies.particles.kriging.interpolated` has the formulas.
+        """
         neighbors = self._neighbors_of(receivers)
         blocks = [interpolated(neighbors.pairs(receivers, self._position, block, self.dtype), self.support,
                                filter_width, self._velocity) for block in neighbors.blocks(KRIGED_TOGETHER)]
@@ -145,7 +153,7 @@ class ParticleField:
 
     def _sums(self, kernel: SmoothingKernel, kind: str, components: int, position: Tensor, count: int,
               scalars: tuple[Tensor, ...] = ()) -> Tensor:
-        """Sums over the particles within the support, (components, count), at the first `count` positions."""
+        """Return the library's sums `kind` over the neighbours of the first `count` positions, (components, count)."""
         space = PairSpace(self._box.length, self._box.periodic_z, kernel.support, 1.0, 1.0, False)
         summand = CompiledSum(kind, _for_library(kernel), scalars=scalars, reads_velocity=False)
         sums, = compiled_sums(space, [summand], [torch.ones(components)], position, None,
@@ -166,7 +174,7 @@ class ParticleField:
 
 
 def grid_points(slab: SlabDecomposition, cells: int) -> Tensor:
-    """Points (m, 3) of a grid of `cells`^3 that lie in this slab, z slowest."""
+    """Return the points (m, 3) of a grid of `cells`^3 points that lie in this slab, with x fastest and z slowest."""
     axis = torch.arange(cells, dtype=torch.float64) * (slab.length / cells)
     # The limits are found in integers: rounded coordinates would assign points on the faces of slabs arbitrarily.
     first, end = (-(-plane * cells // slab.planes) for plane in (slab.start, slab.stop))
@@ -175,12 +183,12 @@ def grid_points(slab: SlabDecomposition, cells: int) -> Tensor:
 
 
 def _for_library(kernel: SmoothingKernel) -> tuple[float, ...]:
-    """The kernel as the numbers that the compiled library takes."""
+    """Return the kernel in the form of the compiled library."""
     return kernel_numbers(kernel.support, kernel.pieces.numpy(), kernel.mean_volume is not None)
 
 
 def _table_sums(kernel: HermiteKernel, pairs: Pairs) -> Tensor:
-    """Factor of each table entry in sum_j W(x_i - x_j): (count, entries)."""
+    """Return the factor of each table entry in sum_j W(x_i - x_j) of each receiver i: (count, entries)."""
     entries, factors = kernel.in_table(pairs.distance)
     total = len(kernel.table)
     sums = pairs.distance.new_zeros(pairs.count * total)

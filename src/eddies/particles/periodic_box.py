@@ -20,7 +20,7 @@ class PeriodicBox(Box):
     periodic_z: bool = True
 
     def nearest_image(self, difference: Tensor, axis: int) -> Tensor:
-        """Differences of one coordinate (any shape), shifted by whole periods to the smallest magnitude."""
+        """Differences of the coordinate `axis` (any shape), shifted by whole periods to the smallest magnitude."""
         if axis == 2 and not self.periodic_z:
             return difference
         return difference - self.length * torch.round(difference / self.length)

@@ -13,19 +13,20 @@ BY_PARTICLE = ("acceleration", "density_rate", "shift_velocity", "shift_accelera
 
 @dataclass(frozen=True)
 class Rates:
-    """Contributions of a term to the rates; each is optional. Contributions of several terms are added.
+    """Contributions of a term to the rates of change of the n owned particles. Those that it does not give are None.
 
     Parameters
     ----------
-    acceleration : (n, 3), of the fluid at the owned particles.
-    density_rate : (n,), rate of change of their density.
-    density : (n,), part of the deviation of their density from the mean, if terms give the density instead of its rate.
+    acceleration : (n, 3), acceleration of the fluid at the particles.
+    density_rate : (n,), rate of change of the density.
+    density : (n,), part of rho - rho_0, with the mean density rho_0, from a term that gives the density, not its rate.
     force_modes : Fourier modes (3, kz, ky, kx) of an acceleration on the grid of the resolved velocity.
-    pressure_modes : modes (kz, ky, kx) of a pressure p divided by the mean density; p / c^2 is added to the density.
+    pressure_modes : Fourier modes (kz, ky, kx) of p / rho_0 for a pressure p. The density gets the part p / c^2, with
+        the speed of sound c.
     shift_velocity : (n, 3), velocity of the particles relative to the fluid, dx/dt = v + shift_velocity.
     shift_acceleration : (n, 3), rate of change of the fluid velocity v at a particle due to the shift.
 
-    Modes of all terms are added before they are interpolated to the particles.
+    The contributions of all terms are added. Modes are added before they are interpolated to the particles.
     """
 
     acceleration: Tensor | None = None
@@ -38,12 +39,12 @@ class Rates:
 
     @property
     def velocity_rate(self) -> Tensor:
-        """dv/dt (n, 3) of the particles: acceleration of the fluid and shift acceleration."""
+        """dv/dt (n, 3) of the particles: the acceleration of the fluid plus the shift acceleration."""
         assert self.acceleration is not None
         return self.acceleration if self.shift_acceleration is None else self.acceleration + self.shift_acceleration
 
     def at(self, rows: Tensor | None) -> Rates:
-        """The rates of some rows (k,) of the particles. The density is still given for all particles."""
+        """Return the rates of the particles `rows` (k,), or of all if it is None. `density` keeps the rows of all."""
         if rows is None:
             return self
         kept = {name: getattr(self, name)[rows] for name in BY_PARTICLE if getattr(self, name) is not None}
@@ -51,14 +52,14 @@ class Rates:
 
 
 def described(value: object) -> str:
-    """A value that a user's code returns, as text: the shape and type of a tensor, or else the class."""
+    """Describe a value that a user's code returns: a tensor by its shape and type, any other value by its class."""
     if isinstance(value, Tensor):
         return f"a tensor of shape {tuple(value.shape)} and type {str(value.dtype).removeprefix('torch.')}"
     return f"a {type(value).__name__}"
 
 
 def total(contributions: Iterable[Rates]) -> Rates:
-    """Sum of contributions; a rate that none of them has is None."""
+    """Return the sum of the contributions of several terms; a rate that none of them has is None."""
     sums: dict[str, Tensor] = {}
     for each in contributions:
         for field in fields(Rates):

@@ -1,4 +1,4 @@
-"""Kernel averages of a quantity that particles carry, and their gradients (Eqs. 5 and 6), by torch."""
+"""Kernel averages of a quantity that particles carry (Eqs. 5 and 6) and the gradients of these averages, by torch."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from eddies.particles.smoothing_kernels import SmoothingKernel, over_distance
 
 
 def volumes(kernel: SmoothingKernel, pairs: Pairs) -> Tensor:
-    """Volume of each particle, 1 / (W(0) + sum_j W(x_i - x_j)), shape (count,); or the kernel's mean volume.
+    """Return the volume 1 / (W(0) + sum_j W(x_i - x_j)) of each particle i, (count,), or the kernel's mean volume.
 
-    `pairs` must not pair a particle with itself; the term W(0) already counts it.
+    `pairs` must not pair a particle with itself: W(0) already counts the particle.
     """
     if kernel.mean_volume is not None:
         return pairs.distance.new_full((pairs.count,), kernel.mean_volume)
@@ -21,7 +21,7 @@ def volumes(kernel: SmoothingKernel, pairs: Pairs) -> Tensor:
 
 
 def reconstruct(kernel: SmoothingKernel, pairs: Pairs, sender_volumes: Tensor, sender_values: Tensor) -> Tensor:
-    """Average <A>(x) = sum_j V_j A_j W(x - x_j) / sum_j V_j W(x - x_j) at the receivers x: (count, components).
+    """Return <A>(x) = sum_j V_j A_j W(x - x_j) / sum_j V_j W(x - x_j) at the receivers x, (count, components).
 
     A kernel with a mean volume gives the numerator alone, Eq. 6. The result is zero where no particle lies within the
     support. The volumes V (s,) and values A (s, components) are those of all local particles. A particle that is a
@@ -32,7 +32,7 @@ def reconstruct(kernel: SmoothingKernel, pairs: Pairs, sender_volumes: Tensor, s
 
 def reconstruct_with_gradient(kernel: SmoothingKernel, pairs: Pairs, sender_volumes: Tensor,
                               sender_values: Tensor) -> tuple[Tensor, Tensor]:
-    """Result of `reconstruct` and its gradient (count, components, 3), the last axis the direction of the derivative.
+    """Return the result of `reconstruct`, and its gradient (count, components, 3) with the direction as the last axis.
 
     The gradient sum_j V_j (A_j - <A>) grad W(x - x_j) / sum_j V_j W is exactly the gradient of the average.
     """
@@ -45,7 +45,7 @@ def reconstruct_with_gradient(kernel: SmoothingKernel, pairs: Pairs, sender_volu
 
 
 def normalisation(kernel: SmoothingKernel, denominator: Tensor) -> Tensor:
-    """1 / denominator, or zero where no particle contributes; 1 for a kernel with a mean volume."""
+    """Return 1 / denominator, or zero where no particle contributes; 1 for a kernel with a mean volume."""
     if kernel.mean_volume is not None:
         return torch.ones_like(denominator)
     empty = denominator == 0
@@ -53,7 +53,7 @@ def normalisation(kernel: SmoothingKernel, denominator: Tensor) -> Tensor:
 
 
 def _average(kernel: SmoothingKernel, pairs: Pairs, volume: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
-    """Average (components, count) and normalisation (1, count).
+    """Return the average (components, count) and its `normalisation` (1, count).
 
     `volume` (m,) and `value` (components, m) are those of the sender of each pair.
     """

@@ -17,27 +17,27 @@ from eddies.particles.least_squares import LeastSquares
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.resolved_velocity import ResolvedVelocity
 
-ANGLE = 0.5  # largest u' k_c dt of a substep of the forecast
+ANGLE = 0.5  # upper limit of u' k_c dt in a substep dt of the forecast
 
 
 @dataclass
 class RememberedVelocity:
     """Estimates the resolved velocity frame by frame, with a forecast from each frame to the next.
 
-    The correlation of a mode with its forecast f is assumed to decay in a time dt to beta = exp(-k u' dt / 2C). The
-    prior then has the mean beta f and the variance  beta^2 V + (1 - beta^2) P.  P is the prior variance of the solver.
-    V is the variance of the previous estimate, 1/V = N/e + 1/(variance of its prior). This holds for N evenly spread
-    particles; e is the energy that the solver expects beyond its modes. So modes that few particles determine collect
-    the information of several frames. Forecasts solve the Navier-Stokes equations for the velocity before the filter,
-    in the modes of the solver.
+    The correlation of a mode with its forecast f is assumed to decay in a time dt to beta = exp(-k u' dt / 2C), where
+    u' is the rms of a velocity component. The prior then has the mean beta f and the variance
+    beta^2 V + (1 - beta^2) P.  P is the prior variance in the solver, and V is the variance of the previous estimate:
+    1/V = N/e + 1/(variance of its prior) for N evenly spread particles. e is the energy of a velocity component that
+    the solver expects beyond its modes. So modes that few particles determine collect the information of several
+    frames. Forecasts solve the Navier-Stokes equations for the velocity before the filter, in the modes of the solver.
 
     Parameters
     ----------
     solver : estimates the first frame, which has no forecast. Its grid, prior and tolerance serve all frames.
-    viscosity : nu.
+    viscosity : kinematic viscosity nu.
     transfer : G (kz, ky, kx), transfer function of the filter that the particles' velocity has passed; 1 without one.
-    memory : C.
-    weight : factor of the noise in the solver, sigma^2 / e; in V a value below 1 is replaced by 1.
+    memory : C; the larger it is, the longer a forecast counts.
+    weight : factor of the noise in the solver, sigma^2 / e. If it is below 1, N/sigma^2 replaces N/e in 1/V.
 
     All methods are collective.
     """
@@ -55,7 +55,7 @@ class RememberedVelocity:
 
     @torch.no_grad()
     def of(self, particles: ParticleSet, time: float) -> Tensor:
-        """Modes (3, kz, ky, kx) of the particles' velocity relative to its mean.
+        """Estimate the modes (3, kz, ky, kx) of the velocity that particles resolve, relative to their mean velocity.
 
         `time` must be later than in the previous call.
         """
@@ -96,7 +96,7 @@ class RememberedVelocity:
             self._penalty, self._count = state["penalty"], state["count"]
 
     def forecast(self, modes: Tensor, step: float) -> Tensor:
-        """The modes after the time `step`, by Runge-Kutta substeps of fourth order."""
+        """Return the modes after the time `step`, by Runge-Kutta substeps of fourth order."""
         whole = modes / self.transfer
         highest = self.solver.grid.resolved * 2 * math.pi / self.solver.grid.decomposition.length
         steps = max(math.ceil(step * highest * self._speed(whole) / ANGLE), 1)
@@ -109,20 +109,20 @@ class RememberedVelocity:
         return whole * self.transfer
 
     def _change(self, whole: Tensor) -> Tensor:
-        """du/dt = P[-div(uu)] + nu laplacian u of the modes that are resolved."""
+        """Return du/dt = P[-div(uu)] + nu laplacian u for the modes `whole` of the velocity u before the filter."""
         grid, equations = self.solver.grid, self.solver.equations
         return -equations.projected(grid.stress_divergence(grid.squares(whole))) \
             - self.viscosity * grid.wavenumber_squared * whole
 
     def _next_penalty(self, worth: Tensor) -> Tensor:
-        """sigma^2 over the variance of the next prior."""
+        """Return sigma^2 divided by the variance of the next prior. `worth` is beta."""
         first, inside = self.solver.equations.penalty, self.solver.equations.inside
         before = max(self.weight, 1.0) * self._count + self._penalty
         variance = worth**2 / before + (1 - worth**2) / torch.where(inside, first, 1.0)
         return torch.where(inside, 1 / variance, 0.0)
 
     def _speed(self, modes: Tensor) -> float:
-        """Rms u' of a velocity component, from modes of the velocity; collective."""
+        """Return the rms u' of a component of the velocity with these modes; collective."""
         grid = self.solver.grid
         square = grid.multiplicity * (modes.real.square() + modes.imag.square()).sum(0)
         return math.sqrt(float(global_sum(grid.decomposition.comm, float(square.sum(dtype=torch.float64)))) / 3)

@@ -47,9 +47,9 @@ class ResolvedFlow:
     grid : grid of the modes.
     velocity : modes (3, kz, ky, kx), solenoidal, |k| <= `grid.resolved`.
     points : the owned particles on the grid.
-    relative_velocity : (n, 3), their velocity minus its mean over all particles.
+    relative_velocity : (n, 3), velocity of the particles minus its mean over the particles of all ranks.
     filter_width : d of the filter that the particles' velocity has passed.
-    left_over : (n, 3), the result of `missing` if it is known.
+    left_over : (n, 3), the result of `missing` if it is known, else None.
     iterations, residual : number of iterations of the solve, and its final residual relative to the velocities.
     converged : whether the residual reached its tolerance.
     """
@@ -78,7 +78,8 @@ class ResolvedFlow:
     def spectrum(self) -> Tensor:
         """E(k) (k_c + 1,), the energy of the modes whose |k| rounds to k = 0, 1, ..., k_c, over all ranks.
 
-        The last shell holds only modes up to k_c; sum E = <u.u>/2 of the resolved velocity. Collective, differentiable.
+        |k| is in units of the smallest wavenumber. The last shell holds only modes up to k_c. The sum of E is <u.u>/2
+        of the resolved velocity u. Collective, differentiable.
         """
         grid = self.grid
         energy = 0.5 * grid.multiplicity * (self.velocity.real.square() + self.velocity.imag.square()).sum(0)
@@ -113,11 +114,11 @@ class ResolvedFlow:
 
     @cached_property
     def smallest_rms(self) -> Tensor:
-        """Root mean square of a velocity component of the smallest scales, the modes of u* with |k| > k_c/2."""
+        """Root mean square of a velocity component of the modes of u* with |k| > k_c/2; collective, differentiable."""
         return self._rms_of(self.unfiltered, self.grid.resolved / 2)
 
     def mean_square(self, modes: Tensor, above: float, below: float = math.inf) -> Tensor:
-        """Mean of u.u over space, from those modes of a vector u that have `above` < |k| < `below`.
+        """Return the mean of u.u over space, where u has the given `modes` with `above` < |k| < `below` alone.
 
         The limits are in units of the smallest wavenumber. Collective, differentiable.
         """
@@ -136,15 +137,15 @@ class ResolvedVelocity:
         minimise  sum_i |v_i - u(x_i)|^2  +  sum_k (sigma^2 / P_k) |u(k)|^2
 
     as for measured particle tracks (Gesemann et al. 2016). The velocities v_i are relative to their mean over all
-    particles. P_k ~ k^(-11/3) f(k eta) G^2 is the expected energy of a component of a mode, f the dissipation range
-    of the spectrum, and G the transfer function of the filter. sigma^2 is `weight` times the energy of a velocity
-    component that this law predicts beyond k_c; this energy acts as noise on the modes up to k_c. Since the filtered
-    velocity is smooth and solenoidal, modes beyond the particles' Nyquist wavenumber are determined too.
+    particles. P_k ~ k^(-11/3) f(k eta) G^2 is the expected energy of a component of a mode. f describes the dissipation
+    range of the spectrum, and G is the transfer function of the filter. sigma^2 is `weight` times the energy of a
+    velocity component that this law predicts beyond k_c; this energy acts as noise on the modes up to k_c. Since the
+    filtered velocity is smooth and solenoidal, modes beyond the particles' Nyquist wavenumber are determined too.
 
-    The solve uses conjugate gradients, preconditioned by 1 / (N + 5 sigma^2/P_k). It ends when the preconditioned
-    residual is `tolerance` times the velocities, or after a given number of `iterations`. A solve that starts from a
-    prediction (`predicted`) or from given modes has the tolerance `tolerance_predicted`. The solve in a backward pass
-    has the tolerance `tolerance_adjoint`.
+    The solve uses conjugate gradients, preconditioned by 1 / (N + 5 sigma^2/P_k). It ends when the norm of the
+    preconditioned residual is `tolerance` times that of the velocities, or after a given number of `iterations`. A
+    solve that starts from a prediction (`predicted`) or from given modes has the tolerance `tolerance_predicted`. The
+    solve in a backward pass has the tolerance `tolerance_adjoint`.
 
     Products of modes above a third of the number of cells are aliased. For fields known at particles the aliasing error
     is far below the error of the highest modes themselves.
@@ -163,7 +164,7 @@ class ResolvedVelocity:
     tolerance, tolerance_predicted, tolerance_adjoint = TOLERANCE, TOLERANCE_PREDICTED, TOLERANCE_ADJOINT
     most_iterations = MOST_ITERATIONS
     iterations: int | None = None
-    #: iterations, residual and convergence of each solve so far
+    #: number of iterations, residual, and whether it converged, of each solve so far
     solves: list[tuple[int, float, bool]]
     #: modes of the last solve; None before the first
     latest: Tensor | None = None
@@ -180,9 +181,9 @@ class ResolvedVelocity:
     @classmethod
     def on_slabs(cls, decomposition: SlabDecomposition, scales: ReferenceScales, margin: float = 0.0,
                  dtype: torch.dtype | None = None, weight: float = WEIGHT) -> ResolvedVelocity:
-        """Make an instance on a grid with one cell for each plane of the slabs, in double precision by default.
+        """Make an instance whose grid has as many cells along each axis as all slabs together have planes.
 
-        Particles may be outside their slab by `margin` at most.
+        Particles may be outside their slab by `margin` at most. The default precision is double.
         """
         highest = resolved_wavenumber(scales.spacing, scales.filter_width, scales.kolmogorov_length)
         shells = int(highest * decomposition.length / (2 * math.pi) + 1e-9)
@@ -192,7 +193,7 @@ class ResolvedVelocity:
         return cls(grid, scales.filter_width, scales.kolmogorov_length, weight)
 
     def of(self, particles: ParticleSet, time: float | None = None, near: Tensor | None = None) -> ResolvedFlow:
-        """The resolved flow of particles.
+        """Compute the resolved flow of particles.
 
         The solve starts from the prediction for `time` if this is given, else from the modes `near` (3, kz, ky, kx), or
         from zero without either.
@@ -221,7 +222,7 @@ class ResolvedVelocity:
         return flow
 
     def band_energies(self, particles: ParticleSet, near: Tensor | None = None) -> Tensor:
-        """Mean kinetic energy <u.u>/2 in bands of `BAND` wavenumber shells from shell 1 on: (bands,), over all ranks.
+        """Return the kinetic energy <u.u>/2 of each band of `BAND` wavenumber shells from shell 1 on: (bands,).
 
         `near` is as in `of`. Collective, differentiable.
         """
@@ -284,14 +285,14 @@ class ResolvedVelocity:
         self.speed = float(state["speed"])
 
     def advected(self, modes: Tensor, step: float, mean: np.ndarray) -> Tensor:
-        """Modes of a field that has moved with the mean velocity for the time `step`."""
+        """Return the modes of a field after it has moved with the `mean` velocity for the time `step`."""
         turns = [torch.exp(-1j * step * velocity * k) for k, velocity in zip(self.grid.wavevector, mean)]
         return math.prod(turns) * modes
 
     # ---- the solve
 
     def _solved(self, flow: ResolvedFlow, start: Tensor | None, count: float, square: float) -> ResolvedFlow:
-        """The flow with the modes of a solve, for `count` particles with sum_i |v_i|^2 = `square`."""
+        """Return the flow with its modes, found from `start`, for `count` particles with sum_i |v_i|^2 = `square`."""
         if start is not None:
             flow = replace(flow, velocity=start)
         missing = flow.missing()
@@ -311,8 +312,8 @@ class ResolvedVelocity:
         return self.equations.solve(flow.points, right, count, enough, self.iterations, self.most_iterations)
 
     def _adjoint(self, flow: ResolvedFlow) -> Callable[[Tensor], Tensor]:
-        """Function that turns the gradient of a loss with respect to the modes u at the minimum into the gradient with
-        respect to the descent d(u; x, v) there.
+        """Return a function that turns the gradient of a loss with respect to the modes u at the minimum into the
+        gradient with respect to the descent d(u; x, v) there.
 
         d vanishes at the minimum and changes with u by -A, so du = A^-1 dd (implicit function theorem). A is symmetric
         in the inner product that weights modes by their multiplicity m. Its transpose is therefore m A (1/m).
@@ -334,7 +335,7 @@ class ResolvedVelocity:
 
 
 class _Moment(NamedTuple):
-    """Modes of the resolved velocity and of its rate of change at a time."""
+    """Modes of the resolved velocity, and of its rate of change, at one time."""
 
     time: float
     velocity: Tensor
@@ -355,15 +356,18 @@ class _Solution(torch.autograd.Function):
 
 
 def dissipation_range(k_eta: np.ndarray) -> np.ndarray:
-    """Factor of spectra in the dissipation range, exp(-5.2 ((k eta)^4 + 0.4^4)^(1/4) + 5.2 * 0.4) (Pope 2000, Eq.
-    6.248)."""
+    """Return exp(-5.2 ((k eta)^4 + 0.4^4)^(1/4) + 5.2 * 0.4), the factor of spectra in the dissipation range (Pope
+    2000, Eq. 6.248)."""
     return np.exp(DISSIPATION * (DISSIPATION_ONSET - (k_eta**4 + DISSIPATION_ONSET**4) ** 0.25))
 
 
 def _prior(grid: FourierGrid, filter_width: float, kolmogorov_length: float,
            inside: Tensor) -> tuple[Tensor, float]:
-    """Energy P_k of each of the two solenoidal components of each mode (kz, ky, kx), and the energy beyond k_c, both as
-    parts of <v.v> = 1."""
+    """Return the energy P_k (kz, ky, kx) of each of the two solenoidal components of a mode, and the energy beyond k_c.
+
+    P_k is in units of <v.v> of the modes up to k_c, and 0 where `inside` is False. The energy beyond k_c is in units of
+    <v.v> of all modes.
+    """
     unit = 2 * math.pi / grid.decomposition.length
 
     def law(shell):

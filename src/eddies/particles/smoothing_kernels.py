@@ -26,8 +26,8 @@ KNOTS = 129
 class SmoothingKernel(Protocol):
     """W(r) in 1/length^3 and dW/dr in 1/length^4 for distances of any shape, zero for r >= `support`.
 
-    With a `mean_volume` V = L^3/N, W may be negative, and <A> = V sum_j A_j W, Eq. 6 as published. Without one, W is
-    nowhere negative, volumes are V_j = 1/sum_k W, and averages are normalised.
+    With a `mean_volume` V = L^3/N, W may be negative, and averages are <A> = V sum_j A_j W, Eq. 6 as published. Without
+    it, W is nowhere negative, particles have the volumes V_j = 1/sum_k W, and averages are normalised.
     """
 
     support: float
@@ -37,8 +37,8 @@ class SmoothingKernel(Protocol):
     def pieces(self) -> Tensor:
         """Polynomial coefficients of W(r) on equal intervals of 0 <= r < support, (intervals, coefficients).
 
-        They belong to u^0, u^1, ..., where u falls from 1 to 0 along an interval: near r = support, where u is small,
-        the terms cancel least.
+        The coefficients are those of u^0, u^1, ..., where u falls from 1 to 0 along an interval. With this u rounding
+        errors are smallest near r = support, where W is small.
         """
 
     def value(self, distance: Tensor) -> Tensor: ...
@@ -47,7 +47,7 @@ class SmoothingKernel(Protocol):
 
 
 class _Polynomial:
-    """SmoothingKernel from a shape W h^3 and its slope, functions of q = r/h on [0, 1)."""
+    """SmoothingKernel with a fixed shape W h^3 and its slope, functions of q = r/h on [0, 1); h is the support."""
 
     mean_volume = None
     shape_pieces: tuple[tuple[float, ...], ...]
@@ -103,8 +103,8 @@ class HermiteKernel:
     ----------
     support : h.
     values, slopes : (knots,), the dimensionless W h^3 and d(W h^3)/dq; all results are differentiable in both.
-    mean_volume : see SmoothingKernel. Without one, values must not be negative. Slopes steeper than three times the
-        value per cell are then reduced to this limit: beyond it a cubic may become negative between the knots.
+    mean_volume : see SmoothingKernel. Without one, values must not be negative, and the magnitude of a slope is
+        limited to 3 value / (distance of two knots): with steeper slopes a cubic may be negative between the knots.
     """
 
     def __init__(self, support: float, values: Tensor, slopes: Tensor, mean_volume: float | None = None) -> None:
@@ -114,7 +114,7 @@ class HermiteKernel:
         self._coefficients = self._cubics(values[:-1], values[1:], self.slopes[:-1], self.slopes[1:])
 
     def _cubics(self, start: Tensor, end: Tensor, first: Tensor, last: Tensor) -> tuple[Tensor, ...]:
-        """Coefficients of cubics over the cells from values and slopes at both ends."""
+        """Return the coefficients of a cubic for each cell, from the values and slopes at both ends of the cell."""
         rise, first, last = end - start, first / self.cells, last / self.cells
         return start, first, 3 * rise - 2 * first - last, first + last - 2 * rise
 
@@ -139,11 +139,11 @@ class HermiteKernel:
 
     @property
     def table(self) -> Tensor:
-        """Values and slopes (2 knots,). Every W(r) is a linear function of them."""
+        """The values, then the slopes, of all knots. W(r) at any r is a linear function of these entries."""
         return torch.cat([self.values, self.slopes])
 
     def in_table(self, distance: Tensor) -> tuple[Tensor, Tensor]:
-        """Indices of the four table entries that give W at each distance (m,), and their factors: (4, m) each."""
+        """Return indices (4, m) of the table entries that give W at each distance (m,), and their factors (4, m)."""
         inside, cell, t = self._locate(distance)
         last = t * t * (3 - 2 * t)
         factors = torch.stack([1 - last, last, t * (1 - t) ** 2 / self.cells, t * t * (t - 1) / self.cells])
@@ -151,7 +151,7 @@ class HermiteKernel:
         return entries, torch.where(inside, factors, torch.zeros_like(factors)) / self.support**3
 
     def _locate(self, distance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Whether each distance is within the support, its cell, and its position in the cell, in [0, 1]."""
+        """Return whether each distance is within the support, its cell, and its position in the cell, from 0 to 1."""
         position = distance * (self.cells / self.support)
         cell = torch.clamp(position.detach().to(torch.int64), 0, self.cells - 1)
         return distance < self.support, cell, torch.clamp(position - cell, max=1)
@@ -176,13 +176,13 @@ class KernelNetwork(nn.Module):
     seed : seed of the initial weights.
     mean_volume : L^3/N for N particles, selects the published form; None for the positive form.
 
-    In the published form the output layer contains alpha, and the loss L_n of Eq. 11 brings the integral near one. This
-    form must not be used for averages that are normalised by the sum of W. They do not depend on alpha, and the sum
-    passes zero where positive and negative weights cancel. With positive weights an average lies between the smallest
-    and the largest of the averaged values.
+    In the published form the output layer contains the factor alpha, and the loss L_n of Eq. 11 brings the integral
+    near one. Averages with this form must not be normalised, that is, divided by the sum of W: this sum is near zero
+    where positive and negative weights cancel, and the result does not depend on alpha. With the positive form an
+    average lies between the smallest and the largest of the averaged values.
 
     The positive form is an even function of q. It is smooth and has no slope at r = 0, as the gradient of a
-    reconstructed field requires. Its output layer starts small, so W starts near the bell g.
+    reconstructed field requires. Its output layer has small initial weights, so W is at first nearly proportional to g.
     """
 
     def __init__(self, support: float, hidden: Sequence[int] = (20, 20, 20, 20), cutoff: str = "smooth", seed: int = 1,
@@ -219,14 +219,14 @@ class KernelNetwork(nn.Module):
                              self.mean_volume)
 
     def integral(self, knots: int = KNOTS) -> Tensor:
-        """Integral of the kernel over space before normalisation: 1/alpha for a positive kernel.
+        """Return the integral of the kernel over space before normalisation: 1/alpha in the positive form.
 
         The loss of Eq. 11 brings the integral of the published form near one.
         """
         return integral(self._unnormalised(knots))
 
     def table(self, knots: int = KNOTS) -> HermiteKernel:
-        """The kernel tabulated at `knots` points, with unit integral if positive; differentiable in the weights."""
+        """Tabulate the kernel at `knots` points; differentiable in the weights. The positive form has unit integral."""
         kernel = self._unnormalised(knots)
         if not self.positive:
             return kernel
@@ -235,7 +235,7 @@ class KernelNetwork(nn.Module):
 
 
 def integral(kernel: SmoothingKernel) -> Tensor:
-    """Integral of a kernel over space, 4 pi int r^2 W dr. The integral of each polynomial piece is exact."""
+    """Return the integral of a kernel over space, 4 pi int r^2 W dr, exactly from its polynomial pieces."""
     pieces = kernel.pieces
     end = torch.arange(1, len(pieces) + 1, dtype=pieces.dtype, device=pieces.device).unsqueeze(1)
     power = torch.arange(1, pieces.shape[1] + 1, dtype=pieces.dtype, device=pieces.device)

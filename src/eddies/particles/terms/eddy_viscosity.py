@@ -15,22 +15,22 @@ from eddies.particles.terms.pair_network import (
 from eddies.particles.terms.term import Coefficient, PairTerm
 from eddies.scene import terms as declared
 
-# Added to |x|^2 in the denominators of mu and q, which limits them at small distances; in units of d^2.
+# This number is added to |x|^2 in the denominators of mu and q, to limit mu and q at small distances; in units of d^2.
 SOFTENING = 0.1
 # Forms of Pi, in the order of their numbers in the compiled library.
 FORMS = "two-sided", "monaghan", "bounded"
 
 
 class EddyViscosity(PairTerm):
-    """dv_i/dt = a_rms s sum_j w Pi b_1 with
+    """Eddy viscosity between two particles, dv_i/dt = a_rms s sum_j w Pi b_1 with
 
         Pi = -|a_1| mu + |a_2| mu^2,   mu = x.v / (|x|^2 + 0.1),
 
-    in the units of `ScaledPairs`. The window w and the scaling s are as in PairNetwork; in the basis "corrected" M_i^-1
-    replaces s. b_1 is x, or x/|x| in the basis "unit". A positive Pi repels. In the form "two-sided" the part mu^2
-    also repels receding pairs. The form "bounded" replaces x.v by tanh(x.v), as the public code of the paper does: the
-    force of a fast pair has a limit. "monaghan" acts on approaching pairs only (mu < 0), as in SPH. a_1 and a_2 are
-    learned.
+    in the units of `ScaledPairs`. a_rms, the window w and the scaling s are as in PairNetwork; in the basis "corrected"
+    M_i^-1 replaces s. b_1 is x, or x/|x| in the basis "unit". A positive Pi repels. In the form "two-sided" the part
+    |a_2| mu^2 also repels receding pairs. In the form "bounded" tanh(x.v) replaces x.v, as in the public code of the
+    paper, so the force of a fast pair has a limit. In the form "monaghan" only approaching pairs (mu < 0) have a force,
+    as in SPH. The coefficients a_1 and a_2 are learned.
     """
 
     Settings = declared.EddyViscosity
@@ -71,11 +71,12 @@ class EddyViscosity(PairTerm):
 
 
 class DensityDiffusion(PairTerm):
-    """d rho_i/dt = -r_rms s sum_j w (|b_1| + |b_2| |q|) q with q = (rho'_i - rho'_j) / (|x|^2 + 0.1), in the units of
-    `ScaledPairs`, as in the public code of the paper.
+    """Diffusion of the density between two particles, as in the public code of the paper:
 
-    r_rms is the rms of the density rate; w and s are window and scaling as in PairNetwork. One particle of a pair gains
-    what the other loses. The coefficients b_1 and b_2 are learned.
+        d rho_i/dt = -r_rms s sum_j w (|b_1| + |b_2| |q|) q,   q = (rho'_i - rho'_j) / (|x|^2 + 0.1),
+
+    in the units of `ScaledPairs`. r_rms is the rms of the density rate. The window w and the scaling s are as in
+    PairNetwork. One particle of a pair gains what the other loses. The coefficients b_1 and b_2 are learned.
     """
 
     Settings = declared.DensityDiffusion

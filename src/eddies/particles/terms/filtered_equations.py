@@ -12,17 +12,21 @@ from eddies.particles.rates import Rates
 from eddies.particles.terms.term import Coefficient, Term
 from eddies.scene import terms as declared
 
-# Two or more sweeps reduce an error to an eighth or less if its eigenvalue lies between LEAST / sweeps^2 and 1.
+# The sweeps of the pressure iterate with the operator -laplacian / sum_j |w_ij|. Two or more sweeps reduce an error
+# to an eighth or less if its eigenvalue lies between LEAST / sweeps^2 and 1.
 LEAST = 2.0
 
 
 class FilteredEquations(Term):
-    """dv/dt = -grad p - div tau + nu laplacian u - C_r (2 u'/d) (v - u),   tau = f (d^2/12) grad u grad u^T
+    """The filtered equations of motion, with derivatives by kriging among neighbours:
 
-    Derivatives of the velocity u and of p come from kriging among the neighbours (eddies.particles.kriging). v - u is
-    the difference between a particle's velocity and the neighbours' estimate. u' is the present rms of a component of
-    v. f is learned. It is near 1, the value of the gradient model (Leonard 1975; Clark et al. 1979). The force of tau
-    is -f (d^2/12) d_j d_k u_i d_k u_j. C_r, C_d and C_p are the settings `relaxation`, `solenoidal` and `density`.
+        dv/dt = -grad p - div tau + nu laplacian u - C_r (2 u'/d) (v - u),   tau = f (d^2/12) grad u grad u^T
+
+    eddies.particles.kriging has the derivatives of the velocity u and of p. v - u is the difference between a
+    particle's velocity and the neighbours' estimate. u' is the present rms of a component of v, d the filter width and
+    nu the viscosity. f is learned. It is near 1, the value of the gradient model (Leonard 1975; Clark et al. 1979). The
+    force -div tau is -f (d^2/12) d_j d_k u_i d_k u_j. C_r, C_d and C_p are the settings `relaxation`, `solenoidal` and
+    `density`.
 
     p, the pressure divided by rho_0, starts from c^2 (rho/rho_0 - 1) with the particles' own density. `sweeps` steps of
     Chebyshev's iteration then reduce the residual
@@ -69,7 +73,7 @@ class FilteredEquations(Term):
         return Rates(acceleration=force.to(velocity), density_rate=change.to(velocity))
 
     def _balanced(self, context: Context, pressure: Tensor, source: Tensor) -> Tensor:
-        """The pressure after the sweeps of Chebyshev's iteration."""
+        """Return the pressure (n,) after the sweeps of Chebyshev's iteration. `source` is s."""
         kriging, source = context.kriging, context.without_mean(source[:, None])[:, 0]
         bound = kriging.laplacian_bound.to(source)
         least, change, factor = min(LEAST / self.settings.sweeps**2, 1.0), torch.zeros_like(pressure), 0.0
@@ -79,4 +83,4 @@ class FilteredEquations(Term):
             factor = 1 / middle if sweep == 0 else 1 / (middle - half**2 * factor / (2 if sweep == 1 else 4))
             change = factor * residual + (factor * middle - 1) * change
             pressure = pressure + change
-        return context.without_mean(pressure[:, None])[:, 0]  # a constant has no Laplacian, so sweeps leave it
+        return context.without_mean(pressure[:, None])[:, 0]  # sweeps leave a constant, as its Laplacian is 0

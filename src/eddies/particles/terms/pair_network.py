@@ -1,4 +1,4 @@
-"""Neural networks for the pairwise force and density rate of Eqs. 3 and 4.
+"""Neural networks for the force and the density rate of a pair, Eqs. 3 and 4.
 
 The module also has the weights, directions and scaling that all sums over pairs use.
 """
@@ -22,31 +22,31 @@ from eddies.particles.terms.term import PairTerm
 from eddies.scene import terms as declared
 from eddies.scene.terms import ForceSum, NetworkSettings, PairSum, TermError
 
-# Added to |x| and |v| in unit vectors, so that coincident particles have no direction.
+# This number is added to |x| and |v| in unit vectors, so that a zero vector divided by its length is zero.
 SMALL = 1e-6
 
 
 def window(pairs: ScaledPairs, settings: PairSum) -> Tensor:
-    """Factor w (m,) of each pair within the radius of interaction h: (1 - q^2)^2 with q = r/h, or 1."""
+    """Return the factor w (m,) of each pair: (1 - q^2)^2 with q = r/h, or 1, within the radius of interaction h."""
     return pairs.weight if settings.window == "smooth" else (pairs.weight > 0).to(pairs.weight)
 
 
 def separation_direction(pairs: ScaledPairs, settings: ForceSum) -> Tensor:
-    """b_1 (3, m): x, or x/|x| in the basis "unit"."""
+    """Return b_1 (3, m), the direction from j to i of each pair: x, or x/|x| in the basis "unit"."""
     return pairs.x / (pairs.distance + SMALL) if settings.basis == "unit" else pairs.x
 
 
 def scaled(sums: Tensor, settings: PairSum, context: Context) -> Tensor:
-    """Sums over neighbours divided by their expected number n, or by its square root."""
+    """Return sums over neighbours divided by their expected number n, or by sqrt(n)."""
     neighbors = context.flow.neighbors
     return sums / (neighbors if settings.scaling == "number" else math.sqrt(neighbors))
 
 
 def along_separation(sums: Tensor, settings: ForceSum, context: Context) -> Tensor:
-    """Sums (3, k) along the separation, scaled, or corrected for the irregular places of the neighbours.
+    """Scale sums (3, k) over vectors b_1, or correct them for the irregular places of the neighbours.
 
     `sums` is sum_j w f b_1 with any factor f of a pair. In the basis "corrected" the result is M_i^-1 sum_j w f x with
-    M_i = sum_j w x x^T. If f is the difference of a field between the two particles, this is the gradient of the field.
+    M_i = sum_j w x x^T. It estimates the gradient of a field if f is the difference of this field between i and j.
     """
     if settings.basis == "corrected":
         return moments.apply_symmetric(context.moments.inverse, sums)
@@ -54,26 +54,27 @@ def along_separation(sums: Tensor, settings: ForceSum, context: Context) -> Tens
 
 
 def density_rate(sums: Tensor, settings: PairSum, context: Context) -> Rates:
-    """Dimensionless sums (1, k), scaled, as a density rate in the units of the flow."""
+    """Scale dimensionless sums (1, k), and convert them to density rates in the units of the flow."""
     rate = context.flow.scales.required("density_rate") * scaled(sums[0], settings, context)
     return Rates(density_rate=rate.to(context.particles.velocity.dtype))
 
 
 def acceleration(scaled: Tensor, context: Context) -> Tensor:
-    """Dimensionless acceleration (3, k) in the units of the flow: (k, 3)."""
+    """Convert a dimensionless acceleration (3, k) to the units of the flow: (k, 3)."""
     return (context.flow.scales.acceleration * scaled.T).to(context.particles.velocity.dtype)
 
 
 def compiled_switches(settings: PairSum) -> tuple[float, float]:
-    """Two numbers for the compiled library: 1 for unit vectors, else 0; and 1 for weighted pairs, else 0."""
+    """Return two numbers for the compiled library: 1 for the basis "unit", else 0; 1 for a smooth window, else 0."""
     return getattr(settings, "basis", "") == "unit", settings.window == "smooth"
 
 
 def compiled_network(network: nn.Module, settings: NetworkSettings, outputs: int, symmetric: bool, context: Context,
                      sign: bool = False) -> CompiledSum | None:
-    """A term's sum with a network, in the form of the compiled library; None for a network of a user's class.
+    """Return a term's sum with a network, in the form of the compiled library; None for a network of a user's class.
 
-    The network has one or two `outputs`. With `sign` the output is multiplied by the sign of the density difference.
+    The network has one or two `outputs`. Its inputs are `ScaledPairs.invariants`, with `symmetric`. With `sign` the
+    output is multiplied by the sign of the density difference.
     """
     if type(network) is not DenseNetwork:
         return None
@@ -103,8 +104,8 @@ def build_network(settings: NetworkSettings, outputs: int, seed: int) -> nn.Modu
 
 
 def outputs_of(network: nn.Module, features: Tensor, outputs: int) -> Tensor:
-    """Outputs (outputs, m) of a network for features (inputs, m) of pairs. Raises TermError if a user's network fails
-    or returns another shape."""
+    """Return the outputs (outputs, m) of a network for features (inputs, m) of pairs. Raises TermError if a user's
+    network fails or returns another shape."""
     with users_code(type(network), TermError):
         found = network(features)
     if not isinstance(found, Tensor) or found.shape != (outputs, features.shape[1]):
@@ -114,17 +115,17 @@ def outputs_of(network: nn.Module, features: Tensor, outputs: int) -> Tensor:
 
 
 class PairNetwork(PairTerm):
-    """dv_i/dt = a_rms A_i with
+    """Forces between pairs of particles by a neural network, dv_i/dt = a_rms A_i with
 
         A_i = s (sum_j w NN_1 x + sum_j w NN_2 v)                            basis "paper"
         A_i = s (sum_j w NN_1 x/|x| + sum_j w NN_2 v/|v|)                    basis "unit"
         A_i = M_i^-1 sum_j w NN_1 x + sum_j w NN_2 v / sum_j w               basis "corrected"
 
-    NN_1 and NN_2 are functions of the invariants of a pair (rho'_i, rho'_j, |x|, |v|, x.v) in the units of
-    `ScaledPairs`. w is the window, s the scaling and M_i = sum_j w x x^T. With symmetry "antisymmetric" the first two
-    invariants are rho'_i + rho'_j and (rho'_i - rho'_j)^2: the forces of a pair are opposite and conserve the total
-    momentum. If the densities are no inputs, the summands of a pair are opposite too. In both cases each pair is
-    evaluated once.
+    NN_1 and NN_2 are the two outputs of a network. Its inputs are the invariants of a pair, rho'_i, rho'_j, |x|, |v|
+    and x.v, in the units of `ScaledPairs`. a_rms is the rms of a component of the acceleration, w the window, s the
+    scaling, and M_i = sum_j w x x^T. With symmetry "antisymmetric" the first two invariants are rho'_i + rho'_j and
+    (rho'_i - rho'_j)^2: the forces on the two particles are opposite and conserve the total momentum. They are also
+    opposite if the densities are not among the inputs. In both cases each pair is evaluated once.
     """
 
     Settings = declared.PairNetwork
@@ -158,11 +159,12 @@ class PairNetwork(PairTerm):
 
 
 class DensityFlux(PairTerm):
-    """d rho_i/dt = r_rms s sum_j w NN_rho, or, with `sign`, r_rms s sum_j w NN_rho sign(rho_i - rho_j).
+    """Density rate by a neural network: d rho_i/dt = r_rms s sum_j w NN_rho.
 
-    r_rms is the rms of the density rate. NN_rho is a separate network, a function of the invariants of a pair; w, s and
-    the invariants are as in PairNetwork. The paper does not state what replaces the directions b_k in the density
-    equation. The sign is taken from the public code.
+    With the setting `sign` each summand has the factor sign(rho_i - rho_j). r_rms is the rms of the density rate.
+    NN_rho is a network of its own, whose inputs are the invariants of a pair. w, s and the invariants are as in
+    PairNetwork. The paper does not state what replaces the directions x and v in the density equation; its public code
+    uses this sign.
     """
 
     Settings = declared.DensityFlux

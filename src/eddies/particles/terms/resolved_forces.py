@@ -15,14 +15,15 @@ from eddies.particles.terms.term import Coefficient, Term
 from eddies.scene import terms as declared
 from eddies.spectral.mode_operators import rising
 
-# Initial damping rates D, proportional to k^2 like those of a small viscosity.
+# Initial values of D/(k_c u_c) at the six wavenumbers of Damping. They are proportional to k^2, like a small viscosity.
 RATES = 0.1 * (torch.arange(1, 7, dtype=torch.float64) / 6) ** 2
 
 
 class Pressure(Term):
-    """-grad p with  laplacian p = -d_i d_j (u_i u_j)  for the resolved velocity u.
+    """The force -grad p with  laplacian p = -d_i d_j (u_i u_j)  for the resolved velocity u.
 
-    The density rho_0 (1 + p / c^2) follows the pressure; there is no density equation and no sound.
+    p is the pressure divided by the mean density rho_0, and c the speed of sound. The density is rho_0 (1 + p / c^2):
+    there is no density equation and no sound.
     """
 
     Settings = declared.Pressure
@@ -35,7 +36,7 @@ class Pressure(Term):
 
 
 class Viscosity(Term):
-    """nu laplacian u for the resolved velocity u and the viscosity nu of the flow."""
+    """The viscous force nu laplacian u, with the resolved velocity u and the viscosity nu of the flow."""
 
     Settings = declared.Viscosity
     linear = True
@@ -46,7 +47,7 @@ class Viscosity(Term):
 
 
 class Stress(Term):
-    """-P[div tau], P the projection on solenoidal fields, for the stress tau that the filter hides:
+    """The force -P[div tau] of the stress tau that the filter hides, with P the projection on solenoidal fields:
 
         tau = G(u* u*) - u u,          u* = u / G                                     form "deconvolution"
         tau = (d^2/12) grad u grad u^T                                                form "gradient"
@@ -78,7 +79,7 @@ def _gradient(flow: ResolvedFlow) -> Tensor:
 
 
 class Damping(Term):
-    """-D(k) u for the modes of the resolved velocity u: a spectral eddy viscosity (Kraichnan 1976).
+    """The damping -D(k) u of the modes of the resolved velocity u, a spectral eddy viscosity (Kraichnan 1976).
 
     D is k_c u_c times six learned values at wavenumbers equally spaced up to the highest resolved one, k_c. D is linear
     between these wavenumbers, with D(0) = 0. u_c is the present rms of a velocity component of the smallest resolved
@@ -105,7 +106,7 @@ class Damping(Term):
 
 
 class Relaxation(Term):
-    """-C (v - u): each particle's velocity v relaxes to the resolved velocity u.
+    """The relaxation -C (v - u) of each particle's velocity v to the resolved velocity u.
 
     The mean of v - u over the particles is subtracted, so the momentum is conserved. C is a learned factor times
     2 u_rms/d, where u_rms is the present rms of a component of u.
@@ -130,11 +131,11 @@ class Relaxation(Term):
 
 
 class Forcing(Term):
-    """f(k) = A u(k) over 0 < |k| < k_f with A = P / sum |u*(k)|^2: linear forcing of the large scales (Lundgren 2003).
+    """The force A u(k) on the modes 0 < |k| < k_f of the resolved velocity u: linear forcing (Lundgren 2003).
 
-    The unfiltered flow is forced by A u*, where u* = u / G is its velocity (`flow/forcing.py`). It receives the power
-    P = `injection_rate`. The filtered flow receives less, A sum |u(k)|^2. A follows
-    from the velocity at each evaluation.
+    The velocity u* = u / G before the filter has the force A u* in the truth (`flow/forcing.py`), and receives the
+    power P = `injection_rate`. So A = P / sum |u*(k)|^2, which is computed at each evaluation. The sum is over the
+    forced modes. The filtered velocity receives a smaller power, A sum |u(k)|^2.
     """
 
     Settings = declared.Forcing
@@ -142,7 +143,7 @@ class Forcing(Term):
     linear = True
 
     def forward(self, context: Context) -> Rates:
-        """Modes of the force. Raises TermError if the forced modes have no energy."""
+        """Return the modes of the force. Raises TermError if the forced modes have no energy."""
         flow, below = context.resolved, self.settings.wavenumber
         square = flow.mean_square(flow.unfiltered, 0, below)
         if square == 0 and self.settings.injection_rate > 0:

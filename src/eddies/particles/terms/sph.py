@@ -18,9 +18,9 @@ from eddies.particles.terms.term import Coefficient, PairTerm
 from eddies.scene import terms as declared
 from eddies.scene.terms import TermSettings
 
-# Added to r^2 in the denominator of mu, which limits mu at small distances; in units of h^2 (Monaghan 1992).
+# This number is added to r^2 in the denominator of mu, to limit mu at small distances; in units of h^2 (Monaghan 1992).
 SOFTENING = 0.01
-# Initial p_b delta_t / (rho_0 c h) in TransportVelocity.
+# Initial value of p_b delta_t / (rho_0 c h) in TransportVelocity.
 BACKGROUND = 0.25
 
 
@@ -44,12 +44,13 @@ class _SPHTerm(PairTerm):
 
 
 class Continuity(_SPHTerm):
-    """d rho_i/dt = rho_i sum_j (m/rho_j) (v_i - v_j).grad W  (Monaghan 2005). `diffusion` adds the term of delta-SPH
-    (Molteni & Colagrossi 2009),
+    """The density equation  d rho_i/dt = rho_i sum_j (m/rho_j) (v_i - v_j).grad W  (Monaghan 2005). If the setting
+    `diffusion` is above 0, the right-hand side also has the term of delta-SPH (Molteni & Colagrossi 2009),
 
         + 2 delta h c sum_j (m/rho_j) (rho_j - rho_i) (-W'/r).
 
-    delta is the only learned parameter. The term uses its magnitude, since a negative value would amplify noise.
+    delta is the only learned parameter; `diffusion` is its initial value. The term uses its magnitude, since a negative
+    delta would amplify noise.
     """
 
     Settings = declared.Continuity
@@ -94,11 +95,11 @@ class WCSPH(_SPHTerm):
         P = c_P^2 rho_0/gamma ((rho/rho_0)^gamma - 1)
         Pi_ij = (-alpha c mu + beta mu^2)/mean(rho_i, rho_j),   mu = h x.v/(r^2 + 0.01 h^2),   if x.v < 0
 
-    with x = x_i - x_j, v = v_i - v_j and r = |x|. Forces of a pair are opposite and central: momentum and angular
-    momentum are conserved. In three dimensions Pi acts like a viscosity of about alpha c h / 10. The learned parameters
-    are c_P/c, alpha and beta. The term uses their magnitudes, so that friction dissipates. Pi contains the c of the
-    flow: with c_P in its place, a large alpha would drive the pressure to zero. gamma is fixed, since it has no effect
-    where the density hardly varies.
+    with x = x_i - x_j, v = v_i - v_j and r = |x|. The forces on the two particles of a pair are opposite and central:
+    momentum and angular momentum are conserved. In three dimensions Pi acts like a viscosity of about
+    alpha c h / 10. The learned parameters are c_P/c, alpha and beta. The term uses their magnitudes, so that friction
+    dissipates. Pi contains the c of the flow. If it contained c_P, training could combine a large alpha with a small
+    c_P, and the pressure would vanish. gamma is fixed, since it has no effect where the density hardly varies.
 
     The sum P_i/rho_i^2 + P_j/rho_j^2 gives a poor pressure gradient among random particles. Differences
     (P_j - P_i)/(rho_i rho_j) halve the error at single moments, but they do not conserve energy: the energy grows until
@@ -149,8 +150,8 @@ class WCSPH(_SPHTerm):
 class TransportVelocity(_SPHTerm):
     """dx_i/dt = v_i + w_i with a shift velocity w that spreads the particles evenly (Adami, Hu & Adams 2013).
 
-    A constant background pressure p_b that acts for a time delta_t causes w. The velocity v_i changes by (w_i.grad) v,
-    so that it remains the velocity of the field at the shifted particle:
+    A constant background pressure p_b that acts for a time delta_t causes w. The velocity v_i changes at the rate
+    (w_i.grad) v, so that it remains the velocity of the field at the shifted particle:
 
         w_i = -(p_b delta_t/m) sum_j (V_i^2 + V_j^2) grad W,   V = m/rho
         (w_i.grad) v = sum_j V_j (v_j - v_i) (w_i.grad W)

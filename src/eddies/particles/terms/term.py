@@ -29,7 +29,7 @@ class Coefficient:
 
     @classmethod
     def of(cls, name: str, learned: Tensor, meaning: str, unit: str = "1", scale: float = 1.0) -> Coefficient:
-        """Coefficient of a parameter `learned`; its value in `unit` is `scale` times the parameter."""
+        """Make the coefficient of the parameter `learned`. Its value in `unit` is `scale` times the parameter."""
         exact = learned.detach().double()
         return cls(name, exact.tolist(), (exact * scale).tolist(), unit, meaning)
 
@@ -40,7 +40,8 @@ class Term(nn.Module, TermBase):
     A user's term derives from this class, declares in its class `Settings` what it reads and gives, and computes its
     contribution in `forward`, in the units of `context.flow`. All ranks evaluate a term together, also ranks without
     particles. A term is `linear` if the rates at given particles are a linear function of the parameters plus a
-    constant. Training then stores the effect of each parameter at a moment instead of computing it at every step.
+    constant. Training then stores the effect of each parameter at each moment, instead of computing it at every
+    training step.
     """
 
     Settings: type[TermSettings] = TermSettings
@@ -52,24 +53,25 @@ class Term(nn.Module, TermBase):
 
     @property
     def learned_coefficients(self) -> list[Coefficient]:
-        """Learned coefficients; by default only the number of parameters."""
+        """Learned coefficients of the term; by default a single one, the number of its parameters."""
         count = sum(parameter.numel() for parameter in self.parameters())
         return [Coefficient("weights", count, count, "1", "number of weights")] if count else []
 
     def forward(self, context: Context) -> Rates:
-        """Contribution to all owned particles; may be collective."""
+        """Return the contribution of the term to the rates of all owned particles; may be collective."""
         raise TermError(f"{type(self).__name__}: has no forward(context); define it, and let it return Rates")
 
 
 class PairTerm(Term, PairSum):
     """A term that is a sum over pairs; see PairSum.
 
-    One pass over the pairs computes the sums of several such terms; there are two passes if terms give a density that
-    others read. Rates are computed for the requested particles; in training these are some of the owned ones.
+    One pass over the pairs computes the sums of several such terms. There are two passes if some terms give a density
+    that other terms read. Rates are computed for the requested particles only; in training these are some of the owned
+    particles.
     """
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
-        """Contribution of the term to the rates of k particles, from the sums (components, k) over their neighbours."""
+        """Return the contribution to the rates of k particles, from the sums (components, k) over their neighbours."""
         raise TermError(f"{type(self).__name__}: has no rates_of(sums, context); define it, and let it return Rates")
 
     def forward(self, context: Context) -> Rates:
