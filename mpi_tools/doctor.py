@@ -1,9 +1,9 @@
-"""Print the libraries of every rank, and test messages and parallel files between the ranks.
+"""Print the libraries of every rank, and test messages between ranks and a file that all ranks write together.
 
     python mpi_tools/launch.py -- .venv/bin/python mpi_tools/doctor.py
 
-Prints one line per rank. In a ring test every rank sends to the next and checks each number that it receives. The exit
-code is the number of complaints, at most 100.
+Prints one line per rank, and its complaints. In a ring test every rank sends numbers to the next rank and checks those
+that it receives. The exit code is the number of complaints, at most 100.
 """
 
 import importlib
@@ -17,7 +17,8 @@ import numpy as np
 
 RING_NUMBERS = 1 << 20
 RING_ROUNDS = 20
-STARTED = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS")  # number of ranks; innermost launcher first
+# Variables with the number of ranks that a launcher has started. Of nested launchers, the innermost comes first.
+STARTED = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS")
 
 
 def versions() -> tuple[str, list[str]]:
@@ -57,7 +58,7 @@ def unconnected(comm: MPI.Comm) -> list[str]:
 
 
 def ring_bandwidth(comm: MPI.Comm) -> tuple[float, list[str]]:
-    """Return the bandwidth (bytes / s) to the next rank while all send at once, and complaints about wrong numbers."""
+    """Return the bandwidth in bytes/s to the next rank while all ranks send, and complaints about wrong numbers."""
     above, below = (comm.rank + 1) % comm.size, (comm.rank - 1) % comm.size
     outgoing = comm.rank + np.arange(RING_NUMBERS, dtype=float)
     incoming = np.empty_like(outgoing)
@@ -72,7 +73,7 @@ def ring_bandwidth(comm: MPI.Comm) -> tuple[float, list[str]]:
 
 
 def parallel_file(comm: MPI.Comm) -> list[str]:
-    """Write a file in the current folder, all ranks together, and read it. Return complaints about its content."""
+    """Write a file in the current folder on all ranks together, and read it. Return complaints about its content."""
     import h5py
     path = Path(f"doctor-{comm.bcast(os.getpid())}.h5")  # a name of its own for each run, the same on all ranks
     with h5py.File(path, "w", driver="mpio", comm=comm) as file:
@@ -109,7 +110,7 @@ def main() -> int:
 if __name__ == "__main__":
     try:
         code = main()
-    except Exception:  # on one rank: the others would wait for it forever
+    except Exception:  # on one rank; without Abort the others would wait for it forever
         traceback.print_exc()
         MPI.COMM_WORLD.Abort(1)
     raise SystemExit(code)

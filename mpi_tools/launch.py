@@ -22,8 +22,8 @@ from pathlib import Path
 sys.path.append(str(Path(__file__).parents[1] / "src"))  # of this checkout, if eddies is not installed yet
 from eddies.cores import check_threads, default_to_one_thread, is_positive, local_cores, threads  # noqa: E402
 
-# RULE is the line above and below a notice of mpirun. NOTICES are beginnings of notices about a non-zero exit code. The
-# ranks have printed the reason of a code in EXPLAINED themselves: bad input, stopped, interrupted.
+# RULE is the line above and below a notice of mpirun. NOTICES are beginnings of notices about a non-zero exit code.
+# EXPLAINED are the exit codes for bad input, stopped and interrupted, whose reason the ranks have printed themselves.
 RULE = b"-" * 74
 NOTICES = (b"Primary job  terminated normally", b"mpirun detected that one or more processes exited with non-zero",
            b"prterun detected that one or more processes exited with non-zero")
@@ -41,14 +41,17 @@ def default_ranks() -> int:
 
 
 def positive(name: str, text: str) -> int:
-    """Return the number in the text of a variable or option; ValueError if it is not a whole number of at least 1."""
+    """Return the number in the `text` of the variable or option `name`.
+
+    Raises ValueError if the text is not a whole number of at least 1.
+    """
     if not is_positive(text):
         raise ValueError(f'{name} = "{text}": must be a whole number of at least 1')
     return int(text)
 
 
 def mpi_environment(ranks: int) -> dict[str, str]:
-    """Return the caller's environment with the variables that `ranks` ranks on this machine need."""
+    """Return this process's environment, extended by the variables that `ranks` ranks on this machine need."""
     needed = {
         # Two jobs on one machine would both be bound to its first cores.
         "OMPI_MCA_hwloc_base_binding_policy": "none",
@@ -67,7 +70,10 @@ def mpi_environment(ranks: int) -> dict[str, str]:
 
 
 def mpirun_command(ranks: int, command: list[str]) -> list[str]:
-    """Return the `mpirun` line that starts `command` on `ranks` ranks; FileNotFoundError without an mpirun."""
+    """Return the command line of `mpirun` that starts `command` on `ranks` ranks.
+
+    Raises FileNotFoundError if there is no mpirun.
+    """
     mpirun = shutil.which("mpirun")
     if mpirun is None:
         raise FileNotFoundError("no mpirun on the PATH: run mpi_tools/bootstrap.sh, or load an MPI module")
@@ -89,7 +95,10 @@ class ErrorOutput:
         return passed
 
     def rest(self) -> bytes:
-        """Return the rest at the end. It has the notices if the ranks wrote nothing or no exit code is in EXPLAINED."""
+        """Return what is still held back when the job has ended.
+
+        Notices are left out if the ranks wrote something else and an exit code in the notices is in EXPLAINED.
+        """
         explained = self._said and any(f"Exit code:    {code}\n".encode() in self._held for code in EXPLAINED)
         return (b"" if explained else self._held) + b"".join(self._frame) + self._line
 
@@ -126,7 +135,8 @@ def pass_errors_on(job: subprocess.Popen) -> None:
 def run_job(line: list[str], environment: dict[str, str]) -> int:
     """Run mpirun to its end. Return its exit code, or 128 plus the number of the signal that ended it.
 
-    mpirun kills its ranks soon after a SIGTERM and returns a code of its own. A SIGUSR1 is only forwarded to them.
+    The first signal reaches mpirun as SIGUSR1, which mpirun only forwards to its ranks. After a SIGTERM it would soon
+    kill them and return a code of its own.
     """
     terminations: list[int] = []
 

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Builds the sdist and from it the wheel, installs the wheel in a new environment, and runs a short scene there, outside
-# the checkout. Without a compiler the build of the wheel must fail with the package to install.
+# the checkout. Without a compiler, the build of the wheel must fail with a message that names the package to install.
 # The environment contains only the wheel. A .pth file adds the packages of .venv, so that torch is not installed again.
 # The eddies of .venv stays hidden: it is itself a .pth file, which Python reads only in an environment's own folder.
 set -euo pipefail

@@ -29,8 +29,8 @@ import pytest
 from mpi_tools.launch import local_cores, mpi_environment, mpirun_command
 
 TIMEOUT = 120.0  # seconds for one test on all its ranks
-STALL = 60.0     # seconds beyond the time limit of a test; then mpirun is stopped if there is no result
-BESIDE = 4       # largest number of one-rank mpirun at the same time
+STALL = 60.0     # seconds after the time limit of a test; if there is no result by then, mpirun is stopped
+BESIDE = 4       # largest number of mpirun that run one-rank tests at the same time
 
 
 def pytest_addoption(parser):
@@ -51,7 +51,7 @@ def pytest_configure(config):
 
 
 def pytest_collection_finish():
-    gc.freeze()  # later collections of garbage leave out what was imported
+    gc.freeze()  # later garbage collections leave out the imported objects
     gc.enable()
 
 
@@ -83,7 +83,7 @@ def comm(pytestconfig):
 
 @pytest.fixture
 def tmp_path(request, pytestconfig, tmp_path):
-    """The tmp_path of pytest, but the same folder for all ranks of an MPI test."""
+    """The folder tmp_path of pytest. For an MPI test, it is the same folder on all ranks."""
     folder = pytestconfig.getoption("--mpi-run")
     if not folder:
         return tmp_path
@@ -157,7 +157,7 @@ class OuterRun:
         return run.records(item)
 
     def close(self, most=None):
-        """End all runs, or those on at most this number of ranks."""
+        """End all runs, or only those on at most `most` ranks."""
         for run in [run for run in reversed(self.runs) if most is None or run.ranks <= most]:
             self.runs.remove(run)
             run.close(self.reported)
@@ -211,10 +211,10 @@ class MpiItem(pytest.Item):
 
 
 class RankRun:
-    """One mpirun of tests on a number of ranks. Several runs may share modules; the first that takes one runs it.
+    """One mpirun of tests on a number of ranks. Several runs may share modules: each takes some of them and runs these.
 
-    To take a module, a run makes a link to its own folder. The link is in the common folder `taken` and is named by the
-    number of the module.
+    To take a module, a run makes a link to its own folder. The link is in the folder `taken`, which the runs share, and
+    its name is the number of the module.
     """
 
     def __init__(self, config, items: list[MpiItem], taken: Path | None = None):
@@ -228,7 +228,8 @@ class RankRun:
         self.read, self.found = [0] * ranks, {}  # bytes read of each rank's records; entries by event and test
         self.output = open(self.folder / "output", "w+b")
         shown = config.option.capture == "no"
-        # The plugin unraisableexception is off: its warnings would not show, and it collects garbage for a second.
+        # The plugin unraisableexception is off, because its warnings would not show and its garbage collection takes a
+        # second.
         inner = [sys.executable, "-m", "pytest", *map(str, self.modules), f"--mpi-run={self.folder}", "-q",
                  "--color=no", "-p", "mpi_tools.pytest_mpi", "-p", "no:cacheprovider", "-p", "no:unraisableexception",
                  f"--rootdir={config.rootpath}", f"--tb={config.option.tbstyle}",
@@ -258,8 +259,10 @@ class RankRun:
         return self.found.get((event, item.nodeid), {})
 
     def wait(self, item: MpiItem, event: str, ranks: int) -> dict[int, dict]:
-        """Wait until this number of ranks have an entry of the event, this run ends, or another run takes the module.
-        Return the entries."""
+        """Wait until this number of ranks have an entry of the event, and return the entries.
+
+        The wait also ends if this run ends or another run takes the module of the test.
+        """
         give_up = time.monotonic() + item.timeout + STALL
         while len(self.entries(item, event)) < ranks and self.process.poll() is None and not self.leaves(item):
             if time.monotonic() > give_up:
@@ -285,7 +288,7 @@ class RankRun:
         """Return the record of a rank that never ended the test: its last stack, or the output of the run."""
         path = self.folder / f"{rank}.stack"
         stack = path.read_text().splitlines() if path.exists() else []
-        # The part of the stack, innermost call first, that lies inside the test.
+        # Only the calls inside the test are kept. The innermost call comes first.
         ours = [index for index, line in enumerate(stack) if "_pytest" in line]
         stack = stack[:ours[0]] if ours else stack
         if stack and stack[0].startswith("Timeout"):
@@ -310,7 +313,7 @@ class RankRun:
                     pass
 
     def close(self, reported: MpiItem | None):
-        """Stop the run, unless its last test has been reported and it ends by itself; remove its folder."""
+        """Stop the run and remove its folder. After the report of its last test, it first has time to end by itself."""
         try:
             self.process.wait(10 if reported is self.items[-1] else 0)
         except subprocess.TimeoutExpired:

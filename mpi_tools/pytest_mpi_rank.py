@@ -16,17 +16,20 @@ GRACE = 3.0  # seconds in which the other ranks must end a test that has failed 
 
 
 class InnerRun:
-    """Runs the tests of FOLDER/tests.json on this rank, in the modules that this mpirun takes. Their results go to
-    FOLDER/RANK.jsonl."""
+    """Runs tests of FOLDER/tests.json on this rank: those in the modules that this mpirun takes.
+
+    The results of the tests go to FOLDER/RANK.jsonl.
+    """
 
     def __init__(self, folder: Path):
-        # A communicator of its own: messages that a failing test leaves on COMM_WORLD cannot arrive here.
+        # This plugin has a communicator of its own, where messages that a failing test leaves on COMM_WORLD cannot
+        # arrive.
         self.comm = MPI.COMM_WORLD.Dup()
         tests = json.loads((folder / "tests.json").read_text())
         self.folder, self.taken, self.timeouts = folder, Path(tests["taken"]), tests["timeouts"]
         self.results = open(folder / f"{self.comm.rank}.jsonl", "w", buffering=1)
         self.stack = open(folder / f"{self.comm.rank}.stack", "w")
-        # mpirun ends the ranks of an aborted run with SIGTERM: each then writes its stack.
+        # mpirun ends the ranks of an aborted run with SIGTERM. Each rank then writes its stack.
         faulthandler.register(signal.SIGTERM, file=self.stack, chain=True)
 
     @pytest.hookimpl(tryfirst=True)
@@ -79,8 +82,10 @@ class InnerRun:
             session.exitstatus = pytest.ExitCode.OK
 
     def record(self) -> dict:
-        """Return the outcome of the test on this rank: that of the first phase (setup, call, teardown) that did not
-        pass, or of the last phase."""
+        """Return the outcome of the test on this rank.
+
+        It is that of the first phase (setup, call, teardown) that did not pass, or of the last phase if all passed.
+        """
         report = next((r for r in self.reports if not r.passed), self.reports[-1])
         return {"rank": self.comm.rank, "outcome": report.outcome, "phase": report.when,
                 "text": reason(report), "expected": hasattr(report, "wasxfail"),
@@ -88,7 +93,7 @@ class InnerRun:
                 "sections": self.reports[-1].sections}
 
     def agree(self, outcome: str) -> bool:
-        """Return, when all ranks have ended the test, whether all had this outcome."""
+        """Wait until all ranks have ended the test, and return whether all had this outcome."""
         code = ["passed", "skipped", "failed"].index(outcome)
         mine, both = np.array([code, -code]), np.empty(2, int)
         self.comm.Allreduce(mine, both, op=MPI.MAX)
@@ -99,7 +104,7 @@ class InnerRun:
 
 
 def reason(report) -> str:
-    """Return the traceback, or the reason why the test was skipped or expected to fail."""
+    """Return the traceback of a test, or the reason why the test was skipped or was expected to fail."""
     if hasattr(report, "wasxfail"):
         return report.wasxfail
     return report.longrepr[2] if report.skipped else report.longreprtext

@@ -3,8 +3,8 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bash mpi_tools/bootstrap.sh
-# As under mpirun: otherwise torch starts a thread per core beside the ranks of a test.
+# One thread, as under mpirun. Otherwise torch starts a thread on every core, beside the ranks of a test.
 export OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
-# Modules are compiled once, not by each of the hundreds of processes that the tests start.
+# Compiled modules are stored. Otherwise each of the hundreds of processes of the tests would compile them again.
 unset PYTHONDONTWRITEBYTECODE
 exec .venv/bin/python -m pytest "$@"

@@ -14,8 +14,8 @@ ORDERS = {"cubic": 3, "quintic": 5}
 class SplineInterpolation:
     """Tensor-product B-splines through the grid values of band-limited fields.
 
-    Dividing each Fourier mode by the transform of the B-spline gives the coefficients of the interpolating spline
-    exactly (Hinsberg et al. 2012). The error of a mode k is of order (k dx)^(degree + 1).
+    Each Fourier mode is divided by the transform of the B-spline. This gives the coefficients of the interpolating
+    spline exactly (Hinsberg et al. 2012). The error of a mode k is of order (k dx)^(degree + 1).
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class SplineInterpolation:
         self.inverse = (1.0 / (transforms[0] * transforms[1] * transforms[2])).astype(grid.real)
 
     def coefficients(self, spectral: np.ndarray) -> list[np.ndarray]:
-        """Return the spline coefficients of fields with modes (c, kz, ky, kx), as the three parts of `with_ghosts`."""
+        """Return the spline coefficients of fields with modes (c, kz, ky, kx), in the three parts of `with_ghosts`."""
         return self.with_ghosts(self.grid.backward(spectral * self.inverse))
 
     def with_ghosts(self, planes: np.ndarray) -> list[np.ndarray]:
@@ -44,7 +44,10 @@ class SplineInterpolation:
         return self._halo.forward(planes)
 
     def at(self, coefficients: Sequence[np.ndarray], positions: np.ndarray) -> np.ndarray:
-        """Return spline values (n, c) at positions (n, 3). `around` states the allowed positions and the errors."""
+        """Return the values (n, c) of splines at positions (n, 3), given their coefficients (see `with_ghosts`).
+
+        `around` states which positions are allowed and which errors are raised.
+        """
         return self.around(positions).at(coefficients)
 
     def around(self, positions: np.ndarray) -> Splines:
@@ -63,9 +66,10 @@ class SplineInterpolation:
                         "lower step, courant or max_step")
 
     def spread(self, values: np.ndarray, splines: Splines) -> np.ndarray:
-        """Return planes (c, z_local, y, x): the sum over all points of `values` (n, c) times the splines of that point.
+        """Return planes (c, z_local, y, x): the sum over all points of `values` (n, c) times the point's splines.
 
-        This is the transpose of `with_ghosts` followed by evaluation at the points.
+        `splines` are those of the points, from `around`. The result is the transpose of `with_ghosts` followed by
+        evaluation at the points. Collective.
         """
         parts = self._halo.parts(np.zeros((values.shape[1], *self.grid.physical_shape), self.grid.real))
         splines.spread(values, parts)
@@ -73,7 +77,7 @@ class SplineInterpolation:
 
 
 def _spline_transform(degree: int, angle: np.ndarray) -> np.ndarray:
-    """Return the discrete Fourier transform, at k dx = `angle`, of the cubic or quintic B-spline at integers."""
+    """Return the discrete Fourier transform, at k dx = `angle`, of the B-spline of this degree sampled at integers."""
     if degree == 3:
         return (2 + np.cos(angle)) / 3
     return (33 + 26 * np.cos(angle) + np.cos(2 * angle)) / 60

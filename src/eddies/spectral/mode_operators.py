@@ -14,7 +14,7 @@ Modes = Any
 
 
 class ModeOperators:
-    """Derivatives and projections of modes with given wavevectors.
+    """Derivatives and projections of fields that are given by their modes.
 
     Parameters
     ----------
@@ -49,14 +49,15 @@ class ModeOperators:
         return self._stack([component - k * along for k, component in zip(self.wavevector, vector)])
 
     def stress_divergence(self, stress: Modes) -> Modes:
-        """Return d_j tau_ij (3, kz, ky, kx) of a symmetric matrix (6, kz, ky, kx)."""
+        """Return d_j tau_ij (3, kz, ky, kx) of a symmetric matrix tau (6, kz, ky, kx)."""
         xx, yy, zz, xy, xz, yz = stress
         return self._stack([self.divergence(row) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))])
 
     def pressure_of(self, stress: Modes) -> Modes:
-        """Return p (kz, ky, kx) of mean zero with  laplacian p = -d_i d_j tau_ij,  for a symmetric matrix tau (6, ...).
+        """Return p (kz, ky, kx), the solution of  laplacian p = -d_i d_j tau_ij  with mean zero.
 
-        div tau + grad p is solenoidal. With tau = u u, p is the kinematic pressure of an incompressible flow u.
+        tau (6, kz, ky, kx) is a symmetric matrix. div tau + grad p is solenoidal. With tau = u u, p is the kinematic
+        pressure of an incompressible flow u.
         """
         kx, ky, kz = self.wavevector
         xx, yy, zz, xy, xz, yz = stress
@@ -65,9 +66,9 @@ class ModeOperators:
 
 
 def rising(shell: Modes, highest: float, values: Modes) -> Modes:
-    """Return a piecewise linear function of |k| = `shell`: a learned damping rate.
+    """Return a piecewise linear function of the wavenumbers `shell`, which serves as a learned damping rate.
 
-    The function is 0 at |k| = 0 and has `values` (n,) at |k| = `highest` i / n, i = 1 ... n. Beyond `highest` it is
+    The function is 0 at k = 0 and has the `values` (n,) at k = `highest` i / n, i = 1 ... n. Beyond `highest` it is
     constant.
     """
     place, result, before = shell * (len(values) / highest), 0.0, 0.0

@@ -17,14 +17,14 @@ from eddies.spectral.mode_operators import ModeOperators
 REAL = {"float64": np.float64, "float32": np.float32}
 COMPLEX = {"float64": np.complex128, "float32": np.complex64}
 
-# Entries of a symmetric matrix, in the order in which they are stored.
+# Indices (i, j) of the entries of a symmetric matrix, in the order in which they are stored.
 SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 Expansion = Callable[[np.ndarray], Sequence[Part]]
 
 
 class _Batch(NamedTuple):
-    """A transpose for a batch of components, and its blocks as ColumnCopies and PlaneCopies take them."""
+    """A transpose for a number of components, and its blocks in the form that ColumnCopies and PlaneCopies take."""
 
     transpose: Transpose
     columns: Blocks
@@ -32,9 +32,9 @@ class _Batch(NamedTuple):
 
 
 class SpectralGrid(ModeOperators):
-    """Fourier transforms on a periodic cube of `cells`^3 points, slab-decomposed, with the modes |k_i| <= cutoff.
+    """Fourier transforms on a periodic cube of `cells`^3 points, divided into slabs, for modes with |k_i| <= cutoff.
 
-    Physical arrays are (components, z_local, y, x), real. Spectral arrays are (components, kz, ky_local, kx), complex.
+    Physical arrays (components, z_local, y, x) are real. Spectral arrays (components, kz, ky_local, kx) are complex.
     They hold kz, ky = 0 ... K, -K ... -1 and kx = 0 ... K, where ky is divided among the ranks:
 
         f(x) = sum over k of f_hat(k) exp(i k.x),      f_hat(k) = mean over x of f(x) exp(-i k.x).
@@ -46,7 +46,8 @@ class SpectralGrid(ModeOperators):
     cutoff : largest wavenumber K of each direction, in units of 2 pi / length, at most (cells - 1) // 2. The default,
         the largest integer below cells / 3, makes quadratic products free of aliasing (Orszag 1971).
 
-    Modes beyond the cutoff are dropped during the transform and are not sent to other ranks.
+    Modes beyond the cutoff are dropped during the transform and are not sent to other ranks. All transforms are
+    collective.
     """
 
     def __init__(self, decomposition: SlabDecomposition, precision: str = "float64", cutoff: int | None = None) -> None:
@@ -54,7 +55,7 @@ class SpectralGrid(ModeOperators):
         self.cutoff = (self.cells - 1) // 3 if cutoff is None else int(cutoff)
         self.precision, self.real, self.complex = precision, REAL[precision], COMPLEX[precision]
         self.modes = 2 * self.cutoff + 1
-        #: first row of ky of each rank in storage order and, at the end, the number of rows: (ranks + 1,)
+        #: (ranks + 1,): number of each rank's first row of ky, counted in the order of storage, then the number of rows
         self.column_starts = block_starts(self.modes, decomposition.size)
         self._batches: dict[tuple[str, int], _Batch] = {}
         self.column_pass = ColumnPass(self.cells, self.cutoff, self.complex)
@@ -70,7 +71,7 @@ class SpectralGrid(ModeOperators):
         #: i kx and i ky, shaped to broadcast over the packed modes (c, pairs, ky, kx) in `expand` of `blocks`
         self.d_dx = (1j * unit * signed).astype(self.complex)[None, None, None, :]
         self.d_dy = (1j * unit * signed).astype(self.complex)[None, None, :, None]
-        #: weight of a stored mode in a sum over all modes: 2, but 1 for kx = 0, where the mode -k is stored, too
+        #: weight of a stored mode in a sum over all modes: 1 for kx = 0, where the mode -k is stored too; otherwise 2
         self.multiplicity = np.where(self.index[0] == 0, 1, 2).astype(self.real)
         #: shape (z_local, y, x) of one component in physical space on this rank
         self.physical_shape = (decomposition.count, self.cells, self.cells)
@@ -114,8 +115,8 @@ class SpectralGrid(ModeOperators):
                  **fields: Any) -> np.ndarray:
         """Return the modes (results, kz, ky_local, kx) of products of fields, formed at the grid points.
 
-        The fields are those of `blocks(spectral, **fields)`. `product(values, out)` gets their values (fields, pairs,
-        y, 2 x) and fills `out` (results, pairs, y, 2 x).
+        The fields are those of `blocks(spectral, **fields)`. The function `product(values, out)` gets their values
+        (fields, pairs, y, 2 x) and writes the products to `out` (results, pairs, y, 2 x).
         """
         blocks = self._batch("forward", results).planes
         for planes, values in self._value_blocks(spectral, **fields):
@@ -125,7 +126,7 @@ class SpectralGrid(ModeOperators):
         return self._planes_to_columns(results)
 
     def squares(self, vector: np.ndarray) -> np.ndarray:
-        """Return the modes (6, kz, ky_local, kx) of u_i u_j, ij = xx, yy, zz, xy, xz, yz, from the modes of u."""
+        """Return the modes (6, kz, ky_local, kx) of u_i u_j, ij = xx, yy, zz, xy, xz, yz; `vector` are those of u."""
         def product(u: np.ndarray, out: np.ndarray) -> None:
             for row, (i, j) in enumerate(SYMMETRIC):
                 np.multiply(u[i], u[j], out=out[row])
@@ -134,11 +135,11 @@ class SpectralGrid(ModeOperators):
 
     def blocks(self, spectral: np.ndarray, fields: int, expand: Expansion | None = None,
                z_derivatives: int = 0) -> Iterator[np.ndarray]:
-        """Yield real fields at all grid points of this rank, a few planes at a time: values (fields, pairs, y, 2 x).
+        """Yield the values (fields, pairs, y, 2 x) of real fields in a few planes at a time, until all planes are done.
 
-        Planes come in pairs, with their two values at a point (y, x) side by side. If the number of planes is odd, the
-        last plane comes alone, as (fields, 1, y, x). A block of planes stays in cache while it is used. The next block
-        uses the same memory.
+        Planes come in pairs, with the values of both planes at a point (y, x) side by side. If the number of planes is
+        odd, the last plane comes alone, as (fields, 1, y, x). A block of planes stays in cache while it is used. The
+        next block uses the same memory.
 
         Parameters
         ----------
@@ -147,15 +148,16 @@ class SpectralGrid(ModeOperators):
         expand : function of packed modes (c, pairs, ky, kx), in which two planes f and g are one complex plane f + i g.
             It gets the packed modes of `spectral`, followed by those of the z derivatives of the first `z_derivatives`
             components. It returns the packed modes of the fields, as a list of parts (c_i, pairs, ky, kx). It may
-            combine its input and multiply it by `d_dx` and `d_dy`. A part (d_dx, modes) stands for their product, which
-            is formed while the modes are copied. By default it returns its input.
+            combine its input and multiply it by `d_dx` and `d_dy`. A part (d_dx, modes) means the product of the two,
+            which is formed while the modes are copied. Without `expand`, the fields are those of its input.
+        z_derivatives : number of components whose z derivatives `expand` gets.
         """
         for planes, values in self._value_blocks(spectral, fields, expand, z_derivatives):
             yield values[..., ::2] if planes.stop - planes.start == 1 else values
 
     def _value_blocks(self, spectral: np.ndarray, fields: int, expand: Expansion | None = None,
                       z_derivatives: int = 0) -> Iterator[tuple[slice, np.ndarray]]:
-        """Yield slices of planes and their values (fields, pairs, y, 2 x); a single plane is paired with itself."""
+        """Yield slices of planes, and the values (fields, pairs, y, 2 x) there. A single plane is its own partner."""
         for planes, packed in self._packed_blocks(spectral, z_derivatives):
             parts = [packed] if expand is None else expand(packed)
             yield planes, self.plane_pass.to_physical(parts, fields, planes).values
@@ -167,7 +169,10 @@ class SpectralGrid(ModeOperators):
             yield planes, copies.pack(blocks, planes)
 
     def _columns_to_planes(self, spectral: np.ndarray, z_derivatives: int) -> _Batch:
-        """Transform components, and z derivatives of the first `z_derivatives` of them, along z; send all to planes."""
+        """Transform modes along z and send the results to the ranks that own the planes; return the batch with them.
+
+        The results are those of all components, followed by the z derivatives of the first `z_derivatives` components.
+        """
         components, copies = len(spectral), self.column_pass.copies
         batch = self._batch("backward", components + z_derivatives)
         modes = self._described(spectral, self.complex, self.spectral_shape)
@@ -184,13 +189,13 @@ class SpectralGrid(ModeOperators):
         return batch
 
     def _described(self, array: np.ndarray, dtype: type, shape: tuple[int, ...]) -> Described:
-        """Return an array (c, *shape) as `Described`, after conversion to `dtype`. ValueError for another shape."""
+        """Return an array as `Described`, after conversion to `dtype`. Raise ValueError unless it is (c, *shape)."""
         array = np.require(array, dtype, "CW")
         require(array, (len(array), *shape), dtype)
         return Described(array)
 
     def _planes_to_columns(self, components: int) -> np.ndarray:
-        """Return the modes of the "forward" batch: redistribute its components to columns, transform them along z."""
+        """Send the components in the "forward" batch to the ranks of their columns; return them transformed along z."""
         batch, copies = self._batch("forward", components), self.column_pass.copies
         batch.transpose.to_columns()
         spectral = np.empty((components, *self.spectral_shape), self.complex)
@@ -204,7 +209,10 @@ class SpectralGrid(ModeOperators):
         return spectral
 
     def _batch(self, direction: str, components: int) -> _Batch:
-        """Return the buffers for `components` components and one `direction`; one transform at a time can use them."""
+        """Return the buffers of transforms of `components` components in this `direction`, "forward" or "backward".
+
+        Only one transform at a time may use them.
+        """
         key = (direction, components)
         if key not in self._batches:
             transpose = Transpose(self.decomposition.comm, self.cells, self.modes, components, self.cutoff + 1,
@@ -214,17 +222,20 @@ class SpectralGrid(ModeOperators):
         return self._batches[key]
 
     def sum_modes(self, density: np.ndarray) -> float:
-        """Return the sum of a real spectral quantity (..., kz, ky_local, kx) over all modes and ranks."""
+        """Return the sum of a real quantity `density` (..., kz, ky_local, kx) over all modes and ranks; collective."""
         return float(global_sum(self.decomposition.comm, np.sum(self.multiplicity * density, dtype=np.float64)))
 
     def mean(self, physical: np.ndarray) -> np.ndarray:
-        """Return the mean over the box of each component of (c, z_local, y, x); shape (c,)."""
+        """Return the means (c,) over the box of the components of an array (c, z_local, y, x); collective."""
         total = global_sum(self.decomposition.comm, physical.sum(axis=(1, 2, 3), dtype=np.float64))
         return total / self.cells**3
 
 
 def regrid(source: SpectralGrid, target: SpectralGrid, spectral: np.ndarray) -> np.ndarray:
-    """Return modes on grid `target` of fields with modes (c, kz, ky, kx) on `source`; 0 where `source` has none."""
+    """Return the modes, on the grid `target`, of fields with the modes `spectral` (c, kz, ky, kx) on the grid `source`.
+
+    Modes that `source` does not have are 0. Collective.
+    """
     K = min(source.cutoff, target.cutoff)
     planes = [np.r_[0 : K + 1, grid.modes - K : grid.modes] for grid in (source, target)]
     sent, received = (np.abs(grid.index[1].ravel()) <= K for grid in (source, target))
