@@ -85,8 +85,8 @@ class InvariantStatistics:
     def of(cls, model: Invariants, truth: Invariants) -> "InvariantStatistics":
         """Return the statistics of model and truth.
 
-        Both are in units of <Q_w> = <W_ij W_ij> / 2 of the truth, where W is the antisymmetric part of the velocity
-        gradient. So a wrong amplitude of the model changes its PDF.
+        In both, Q is in units of <Q_w> of the truth, and R in units of <Q_w>^(3/2) (see `enstrophy_scale`). So a wrong
+        amplitude of the model changes its PDF.
         """
         model_plane, truth_plane = (run.normalized(truth.scale) for run in (model, truth))
         bins = InvariantBins.covering(*truth_plane)
@@ -109,7 +109,7 @@ def conditional_flows(run: Rollout, bins: InvariantBins) -> tuple[ConditionalVel
     """Return the mean (dQ/dt, dR/dt) given (Q, R), first of the model and then of the truth, over all common frames.
 
     Return None if there are fewer than two common frames. Rates are finite differences between successive frames. The
-    units of Q, R and the rates are powers of <Q_w>, which is the mean of the truth's values in the two frames.
+    units of Q, R and the rates are powers of <Q_w> of the truth, averaged over the two frames of a difference.
     """
     times = run.common.times
     if times.size < 2:

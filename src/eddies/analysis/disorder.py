@@ -1,7 +1,7 @@
 """Disorder and conservation: distances and counts of particles, and drifts of their momentum and mean density.
 
-Randomly placed particles that follow a solenoidal flow stay randomly placed. Those of a model may cluster, line up or
-oscillate.
+Randomly placed particles that follow a solenoidal flow stay randomly placed. The particles of a model may cluster, line
+up or oscillate.
 """
 
 import numpy as np

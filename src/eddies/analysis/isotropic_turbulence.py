@@ -173,7 +173,7 @@ class StationarySpan:
 
         The budget is -S (35/2) (W/15)^(3/2) = nu <|grad w|^2> + 1/2 dW/dt. w is the vorticity, W = <w.w> = eps/nu the
         enstrophy, and <|grad w|^2> = 2 sum k^4 E(k) (Batchelor & Townsend, Proc. R. Soc. A 190, 534, 1947). The
-        enstrophy that the forcing injects is neglected: 1 % at Re_lambda = 85, 8 % at 25.
+        enstrophy that the forcing injects is neglected. It is 1 % of the budget at Re_lambda = 85, and 8 % at 25.
         """
         enstrophy = self.columns["dissipation_rate"] / self.viscosity
         destroyed = 2 * self.viscosity * self.spectra @ np.arange(self.spectra.shape[1]) ** 4.0
@@ -244,7 +244,7 @@ def _spectrum_rows(span: StationarySpan) -> list[Row]:
 
 
 def _compressibility_rows(span: StationarySpan) -> list[Row]:
-    """Return rows for the turbulent Mach number M_t, and for quantities that scale with a power of a small M_t.
+    """Return rows for the turbulent Mach number M_t, and for quantities that vary as a power of M_t if it is small.
 
     The density follows the pressure of the incompressible flow, rho' = p / c^2. Therefore rho_rms is proportional to
     M_t^2, and the compressible velocity to M_t^2 u' (pseudo-sound: Ristorcelli, J. Fluid Mech. 347, 37, 1997).

@@ -57,7 +57,7 @@ class PathStatistics:
 def of_both(run: Rollout) -> tuple[PathStatistics, PathStatistics]:
     """Return the statistics of model and truth over all common frames.
 
-    Tetrads are chosen from the true positions in the first common frame, and are the same particles in both.
+    Tetrads are chosen from the true positions in the first common frame. Model and truth use the same particles.
     """
     tetrads = near_tetrads(run.pair(0, "position").truth, run.length)
     return path_statistics(run.model, run.common.model, tetrads), path_statistics(run.truth, run.common.truth, tetrads)
@@ -255,7 +255,7 @@ def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], to
              followed: int) -> list[np.ndarray]:
     """Return, for each distance, the row numbers (2, m) of the pairs of particles at this distance.
 
-    The distance of a pair may differ from it by the relative `tolerance`. The first particle of a pair is in the first
+    `tolerance` is the largest relative deviation from this distance. The first particle of a pair is in the first
     `followed` rows of `position` (n, 3). Each pair appears once.
     """
     centres, tree = search_tree(position[:followed], length), search_tree(position, length)

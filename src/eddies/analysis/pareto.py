@@ -34,9 +34,9 @@ def verdict(model: Method, others: Sequence[Method], measures: Mapping[str, str]
 
     The model is worth its cost in a measure if it has no rival. A rival is another method that costs no more and is at
     least as accurate. Errors count as equal if they differ by at most the larger of their spreads over realisations.
-    A method that lacks the cost or the error is no rival. The second text names the cheapest rival in each measure and
-    the number of further ones, and the measures that the model lacks. Without other methods, there is one text that
-    says so. `measures` maps keys of errors to their names in words.
+    A method that lacks the cost or the error is no rival. For each measure with rivals, the second text names the
+    cheapest rival and the number of further ones. It also names the measures for which the model has no number. Without
+    other methods, there is one text that says so. `measures` maps keys of errors to their names in words.
     """
     if not others:
         return ["No other method was run."]

@@ -60,7 +60,7 @@ def sampling_divergence(rows: int, probabilities: Callable[[np.ndarray], np.ndar
 def standardized(values: np.ndarray, reference: np.ndarray | None = None) -> np.ndarray:
     """Return (values - mean) / standard deviation, with the mean and the standard deviation of `reference`.
 
-    `reference` is by default `values`. Raises ValueError if it is constant.
+    `reference` is by default `values`. Raises ValueError if all values of `reference` are equal.
     """
     reference = values if reference is None else reference
     deviation = np.std(reference)

@@ -17,7 +17,7 @@ def spectrum_error(energy: np.ndarray, reference: np.ndarray, largest_wavenumber
 
 
 def band_ratios(energy: np.ndarray, reference: np.ndarray, largest_wavenumber: float) -> dict[str, float]:
-    """Return the energy in each band of shells divided by that of the reference: "1-2", "3-4", "5-8", ...
+    """Return, for each of the bands of shells "1-2", "3-4", "5-8", ..., its energy divided by that in `reference`.
 
     All bands together have the shells of `spectrum_error`, so the last band may be narrower.
     """

@@ -1,7 +1,7 @@
 """Statistics of the tracers of a ground truth: energy, acceleration, Lagrangian structure function, pair dispersion.
 
-Unless the tracers follow the whole flow, only the eddies that pass the filter determine their accelerations and small
-separations.
+Tracers usually follow the filtered flow. Then only the eddies that pass the filter determine the accelerations of the
+tracers and the changes of their small separations.
 """
 
 from collections.abc import Mapping

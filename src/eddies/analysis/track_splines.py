@@ -4,9 +4,9 @@ Each track is approximated by a cubic spline s(t) with a knot at each time t_i o
 
     sum_i |x_i - s(t_i)|^2 + mu h^5 int |s'''|^2 dt,    h the median interval of all tracks.
 
-This estimate assumes that the measuring errors have equal variance and that the jerk, the third derivative of x, is
-white noise (TrackFit; Gesemann, Huhn, Schanz and Schröder 2016). The spline damps angular frequencies above
-mu^(-1/6) / h. It needs no condition at the ends of a track.
+x_i are the measured positions. This estimate assumes that their errors have equal variance, and that the jerk, the
+third derivative of the true position, is white noise (TrackFit; Gesemann, Huhn, Schanz and Schröder 2016). The spline
+damps angular frequencies above mu^(-1/6) / h. It needs no condition at the ends of a track.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class SmoothedTracks:
 
     Parameters
     ----------
-    rows : index, in the arguments of `smooth`, of each row here. Tracks with fewer than three rows are left out.
+    rows : for each row, its row number in the arguments of `smooth`. Tracks with fewer than three rows are left out.
     position, velocity : (rows, 3). Positions are continuous along a track.
     smoothing : mu of the splines.
     """
@@ -118,7 +118,7 @@ class Fit:
 def _smoothing_of(fits: list[Fit], noise: float) -> float:
     """Return the mu for which the residuals of the longest tracks have the variance noise^2.
 
-    Without such a value, return the nearest of NO_NOISE and MOST.
+    If no mu between NO_NOISE and MOST has this property, return the nearer of these two.
     """
     longest = sorted(fits, key=lambda fit: -len(fit.times))
     chosen = longest[:np.searchsorted(np.cumsum([fit.tracks for fit in longest]), TRIED) + 1]

@@ -82,8 +82,7 @@ class InvariantBins:
         return np.histogram2d(*clipped, (self.second, self.third))[0] / second.size
 
     def coarser(self) -> "InvariantBins":
-        """Return at most 18 bins per axis over the same ranges, because conditional means need more particles per cell.
-        """
+        """Return bins over the same ranges, at most 18 per axis: conditional means need more particles per cell."""
         edges = min(18, self.second.size - 1) + 1
         return InvariantBins(*(np.linspace(fine[0], fine[-1], edges) for fine in (self.second, self.third)))
 

@@ -125,7 +125,8 @@ def largest(*arrays: np.ndarray) -> float:
 def draw_pdfs(axis: Axes, truth: np.ndarray, model: np.ndarray, edges: np.ndarray) -> None:
     """Draw the PDFs of true and modelled values, and a Gaussian.
 
-    Values are standardised with the mean and the standard deviation of the truth. `edges` are the bins for them.
+    Values are standardised with the mean and the standard deviation of the truth. `edges` are the edges of the bins for
+    these standardised values.
     """
     centres = bin_centres(edges)
     densities = (pdf(standardized(values, truth), edges) for values in (truth, model))

@@ -47,7 +47,10 @@ def invariant_divergence(model: Sequence[Invariants], flow: Invariants) -> float
 
 
 def section(run: Rollout, span: StationarySpan) -> Section:
-    """Return the section. Averages of the model are over the second half of the time before `run.broken`."""
+    """Return the section. Averages of the model are over the second half of the time before `run.broken`.
+
+    They are compared with averages over `span`, the stationary state of the ground truth.
+    """
     shown, turnover = Section("forced", "Forced rollout beside the stationary state"), run.turnover
     frames = run.before_broken("model")
     if not len(frames):

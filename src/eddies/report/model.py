@@ -107,7 +107,7 @@ def _written(coefficient: Mapping[str, Any]) -> str:
 
 def source_metrics(mach: float | None, errors: Table, source_mach: float | None,
                    source_errors: Table) -> list[Metric]:
-    """Return the turbulent Mach number M_t and the mean error of this flow, and those of the flow of the training.
+    """Return the turbulent Mach number M_t and the mean acceleration error, for this flow and for that of the training.
 
     mach, errors: M_t and the table of a-priori errors of this flow. source_mach, source_errors: those of the flow of
     the training. An M_t is None for an incompressible fluid. The means are over the frames after the training window.

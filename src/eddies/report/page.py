@@ -91,7 +91,7 @@ class Section:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """What the page shows of the run itself: its name, its title, the text of its scene, and more.
+    """What the page shows of the run itself, such as its name, its title and the text of its scene.
 
     products: rows of a table; the first is the header, and each other row is on a product. warnings: sentences on
     products that do not fit together. links: title and relative path of each page to which this one has a link.
