@@ -157,9 +157,9 @@ def too_late(guard: Guard, key: str) -> SceneError:
 
 
 def run_for(flow: FlowRun, time: Time) -> None:
-    """Run the flow for a duration after its start or spin-up.
+    """Run the flow for [time] duration after its start or after the spin-up.
 
-    Raises SceneError if that takes too many steps, or if the flow has already passed the end.
+    Raises SceneError if this takes too many steps, or if the flow has already passed the end.
     """
     clock, duration = flow.clock, time.duration
     if flow.phase == "start":
@@ -175,7 +175,7 @@ def run_for(flow: FlowRun, time: Time) -> None:
 def spin_up(flow: FlowRun, turnovers: float, time: Time) -> None:
     """Run the flow for a number of eddy turnovers.
 
-    Raises SceneError if that takes too many steps, as in a flow without forcing that comes to rest.
+    Raises SceneError if this takes too many steps, for example because a flow without forcing comes to rest.
     """
     history = flow.history
     progress = ProgressLine("spin-up", history.describe, done=history.rows[-1]["turnovers"] / turnovers)

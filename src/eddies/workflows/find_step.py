@@ -115,7 +115,7 @@ class Trial:
 
     @property
     def tolerance(self) -> float:
-        """The rollout with twice this step has converged if its distance to this one is less than this number:
+        """The rollout with twice this step has converged if its distance from this rollout is less than this number:
         sqrt(1.02^2 - 1) times `error`, at least 1e-3."""
         return max(math.sqrt((1 + LARGEST_ERROR_SHARE) ** 2 - 1) * self.error, LEAST_TOLERANCE)
 

@@ -50,7 +50,7 @@ def free_disk_at(directory: Path, comm: Comm) -> float:
 
 
 def memory_of_node(comm: Comm) -> float:
-    """Return the physical memory in bytes of the smallest node; all ranks call it."""
+    """Return the physical memory in bytes of the node with the least memory; all ranks call it."""
     return float(global_min(comm, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")))
 
 

@@ -125,8 +125,8 @@ class Report:
         return page / "report" if self.output is None else self.output / page.relative_to(self.directory)
 
     def links(self, page: Path) -> list[tuple[str, str]]:
-        """Return the titles and relative paths of the other pages. `page` is the directory of the page that links to
-        them."""
+        """Return the titles and relative paths of the other pages, for links on the page of the run directory
+        `page`."""
         found = [] if page == self.directory else [(f"all of {self.scene_name}", self.directory)]
         found += [(name, where) for name, where in self.pages.items() if where not in (page, self.directory)
                   and not (page == self.directory and name == self.main)]
@@ -190,8 +190,7 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: S
 
 
 def sections_of(directory: Path, alone: Comm) -> list[Section]:
-    """Make all sections of the main page of a run directory on one rank, and return them. Their figures are not
-    drawn."""
+    """Make all sections of the main page of a run directory on one rank, with figures that are not yet drawn."""
     scene, report = _plan(directory)
     report = replace(report, pages={report.main: report.pages[report.main]})
     made, found = _make(report, alone, alone, StopRequest(alone), draw=False)

@@ -130,8 +130,7 @@ def take_weights(source: StoredWeights, definition: ModelDefinition, seen: float
 
 
 class LearningCurves:
-    """Draws the history of a training to a file, on rank 0, every DRAWING_SECONDS. A failure is logged once as a
-    warning."""
+    """Draws the history of a training to a file on rank 0, now and then. A failure is logged once as a warning."""
 
     def __init__(self, comm: Comm, path: Path) -> None:
         self.comm, self.path, self._drawn, self._failed = comm, path, time.monotonic(), False

@@ -23,22 +23,22 @@ class Turbulence:
 
     @property
     def turnover_time(self) -> float:
-        """T = L / u'."""
+        """Eddy turnover time T = L / u'."""
         return DISSIPATION_CONSTANT * self.velocity_rms**2 / self.dissipation_rate
 
     @property
     def kolmogorov_length(self) -> float:
-        """eta = (nu^3 / eps)^(1/4)."""
+        """Kolmogorov length eta = (nu^3 / eps)^(1/4)."""
         return (self.viscosity**3 / self.dissipation_rate) ** 0.25
 
     @property
     def kolmogorov_time(self) -> float:
-        """t_eta = (nu / eps)^(1/2)."""
+        """Kolmogorov time t_eta = (nu / eps)^(1/2)."""
         return math.sqrt(self.viscosity / self.dissipation_rate)
 
     @property
     def reynolds_lambda(self) -> float:
-        """Re_lambda = u' lambda / nu with lambda = (15 nu u'^2 / eps)^(1/2)."""
+        """Reynolds number Re_lambda = u' lambda / nu with lambda = (15 nu u'^2 / eps)^(1/2)."""
         return self.velocity_rms**2 * math.sqrt(15 / (self.viscosity * self.dissipation_rate))
 
 
@@ -61,7 +61,7 @@ class Estimates:
     Parameters
     ----------
     turbulence : sustained by the forcing, or decaying from a random start; None for other flows.
-    peak_speed : maximum of |u| + |v| + |w|; None if the flow is from a file or of the user and has no forcing.
+    peak_speed : maximum of |u| + |v| + |w|; None if the flow comes from a file or from the user and is not forced.
     rms_speed : rms of the velocity vector; None where `peak_speed` is None, and for a pure sound wave.
     mach : turbulent Mach number; None for a fluid without a sound speed.
     courant_step : longest step of the direct simulation that its Courant number allows.
@@ -156,8 +156,8 @@ def expected_turbulence(flow: Flow, initial: Initial, forcing: Forcing | None) -
 
 
 def peak_speed(flow: Flow, initial: Initial, turbulence: Turbulence | None) -> float | None:
-    """Return the expected maximum of |u| + |v| + |w|; None if the flow is from a file or of the user and has no
-    forcing."""
+    """Return the expected maximum of |u| + |v| + |w|; None if the flow comes from a file or from the user and is not
+    forced."""
     if turbulence or initial.flow.turbulent:
         return PEAK_SPEED * (turbulence.velocity_rms if turbulence else initial.amplitude)
     if initial.flow.sound:

@@ -1,4 +1,4 @@
-"""A run of the direct simulation, alone or with tracers whose frames are stored, and its state for checkpoints."""
+"""A run of the direct simulation, with or without tracers. It stores frames of the tracers, and can be continued."""
 
 from __future__ import annotations
 
@@ -81,8 +81,7 @@ class FlowRun:
                 **self.history.state_dict(), **(self.tracers.state_dict() if self.tracers else {})}
 
     def load_state_dict(self, saved: Checkpoint) -> None:
-        """Continue from a checkpoint, made on any number of ranks. TracerRun and TracerSet read the state of the
-        tracers."""
+        """Continue from a checkpoint that was made on any number of ranks. The tracers read their own state."""
         self.phase, self.began = saved["phase"], saved["began"]
         self.state = restored_modes(self.fluid.grid, saved, 4)
         self.clock.load_state_dict(saved["clock"])
@@ -97,7 +96,7 @@ class TracerSet:
     Parameters
     ----------
     fluid, state : the flow.
-    settings, seed : settings of the set, and the seed of random places.
+    settings, seed : settings of the set, and the seed of random positions.
     saved : the checkpoint, or None to release new particles.
     suffix : added to the names of the set's series in segments and of its arrays in checkpoints (`suffix_of`).
     """
@@ -172,7 +171,7 @@ class TracerRun:
     ----------
     flow : the run of the flow. Its forcing ends at the release unless [tracers] forced is true.
     segments : the files for the frames.
-    settings, seed : [tracers], and the seed of random places.
+    settings, seed : [tracers], and the seed of random positions.
     whole : function that takes the number of frames, and returns the numbers of those frames that also store the
         unfiltered flow. All of these frames have filtered fields.
     saved : the checkpoint, or None.
@@ -248,7 +247,7 @@ class TracerRun:
         flow.history.leave_out(time.perf_counter() - began)
 
     def _store(self) -> None:
-        """Store a frame. Every `field_every` frames it has filtered fields and spectra. Times count from the
+        """Store a frame, with filtered fields and spectra in every `field_every`-th frame. Times count from the
         release."""
         state, fluid, time_since = self.flow.state, self.flow.fluid, self.flow.clock.time - self.released_at
         steps, with_fields = self.flow.clock.steps, self.stored % self.settings.field_every == 0
@@ -277,8 +276,7 @@ def suffix_of(name: str) -> str:
 
 
 def frame_layout(settings: Tracers, compressible: bool, cutoff: int) -> FrameLayout:
-    """Return the layout of the frames of all sets of tracers. `cutoff` is the largest wavenumber of the unfiltered
-    flow."""
+    """Return the layout of the frames of all sets. `cutoff` is the largest wavenumber of the unfiltered flow."""
     columns, variables = {"position": (3,), "velocity": (3,)}, {"velocity": 3}
     if compressible:
         columns, variables = columns | {"density": ()}, variables | {"density": 1}

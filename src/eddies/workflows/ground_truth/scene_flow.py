@@ -94,7 +94,8 @@ def given_spectrum(initial: Initial, comm: Comm) -> tuple[np.ndarray, np.ndarray
 def stored_states(initial: Initial, comm: Comm) -> Iterator[StoredStates | VelocityCubes]:
     """Open the file of unfiltered flow states from which a scene starts; all ranks call it.
 
-    Raises SceneError if the file has no state with the number [initial] state, ProductError if it has no state at all.
+    Raises SceneError if no state in the file has the number that [initial] state gives. Raises ProductError if the file
+    holds no states.
     """
     with open_states(comm, initial.file) as states:
         if initial.state >= len(states):

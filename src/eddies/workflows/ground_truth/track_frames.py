@@ -181,9 +181,9 @@ def _at_frames(found: Tracks, settings: Settings) -> Tracks:
 def _placed(found: Tracks, settings: Settings) -> tuple[Tracks, float, float, np.ndarray]:
     """Place the tracks in a periodic cube.
 
-    Returns the tracks with their new positions, the edge of the cube, the measured volume, and the position in the cube
-    of the origin of the file's coordinates. If the measured volume is not periodic, it lies in the middle of a larger
-    cube, at least [tracks] margin away from its periodic images.
+    Returns the tracks with their new positions, the edge of the cube, the measured volume, and the position that the
+    origin of the file's coordinates has in the cube. If the measured volume is not periodic, it lies in the middle of a
+    larger cube, at least [tracks] margin away from its periodic images.
     """
     if settings.volume is None:
         edge = settings.box if settings.box is not None else found.edge

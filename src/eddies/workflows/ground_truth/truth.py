@@ -1,4 +1,4 @@
-"""Read the ground truth: frames of particles, each on the rank of its slab, and fields and scales."""
+"""Read the ground truth: frames of particles, fields and scales."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ Result = TypeVar("Result")
 class GroundTruth:
     """An open ground_truth.h5 that all ranks read. A particle is on the rank whose slab of `decomposition` holds it.
 
-    `planes` is the number of planes of all slabs together. By default it is that of the grid of the resolved velocity.
-    The methods return arrays on the host. `device` is the device to which training and rollouts copy them.
+    `planes` is the number of planes of all slabs together. By default it is the number of planes of the grid of the
+    resolved velocity. The methods return arrays on the host; training and rollouts copy them to `device`.
 
-    For an incompressible fluid no density is stored: `has_density` is false and columns of the density are missing.
+    For an incompressible fluid no density is stored: `has_density` is false, and columns of the density are missing.
     All ranks raise ProductError if one of them reads a value that is not finite.
     """
 
@@ -64,7 +64,7 @@ class GroundTruth:
             kolmogorov_length=r["kolmogorov_length"], **density)
 
     def particles(self, frame: int) -> dict[str, np.ndarray]:
-        """Return the columns `id`, `position`, `velocity` and, if stored, `density` of this rank's particles at a
+        """Return the columns `id`, `position`, `velocity` and, if stored, `density` of this rank's particles in a
         frame."""
         return migrate(self.decomposition, self.block(frame))
 
@@ -119,8 +119,8 @@ class GroundTruth:
         return field.reshape(3, -1).T.astype(np.float64)
 
     def block(self, frame: int, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """Return the ids and the columns `names` (by default all) of the particles in this rank's block of ids, at a
-        frame."""
+        """Return the ids and the columns `names` (by default all) of a frame, for the particles in this rank's block of
+        ids."""
         start, stop = id_block(self.decomposition.comm, self.total)
         names = ("position", *self._evolving) if names is None else names
         columns = self._together(lambda: {name: self.trajectory.read(frame, name, start, stop) for name in names})

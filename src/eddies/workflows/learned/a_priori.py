@@ -27,9 +27,10 @@ def evaluate(truth: GroundTruth, model: LagrangianModel, last_seen: int,
              dtype: torch.dtype) -> dict[str, dict[str, np.ndarray]]:
     """Test a model at frames with a filtered field, and return tables by name; collective.
 
-    The frames are evenly spread over the ground truth. `acceleration_sample` and, if learned, `density_rate_sample`
-    hold true and predicted rates at the last of these frames. `a_priori` has a row for each frame, with the `delay`
-    since frame `last_seen`, negative before it, and these normalised L2 errors:
+    The frames are evenly spread over the ground truth. `acceleration_sample` holds true and predicted accelerations at
+    the last of these frames. If the model learns the rate of the density, `density_rate_sample` holds this rate in the
+    same way. `a_priori` has a row for each frame, with the `delay` since frame `last_seen`, negative before it, and
+    these normalised L2 errors:
 
     `acceleration_error`: of the model's acceleration as in a rollout, with the density that its terms give.
     `true_density_acceleration_error`: of the model's acceleration with the true density.

@@ -84,8 +84,7 @@ def _form(tensor: torch.Tensor) -> str:
 
 
 def _bytes(tensor: torch.Tensor) -> np.ndarray:
-    """Return the memory of a tensor as bytes, without a copy. This also works for number types that numpy or MPI
-    lack."""
+    """Return the memory of a tensor as bytes, without a copy. This works also for types that numpy or MPI lack."""
     return tensor.reshape(-1).view(torch.uint8).numpy()
 
 

@@ -39,7 +39,7 @@ Trainer = TypeVar("Trainer")
 
 
 def training_phases(data: Sequence[TrainingData], kernel_file: Path) -> list[Phase]:
-    """Return all phases of a training; none if the model has no parameters. The kernel is read only if there is a field
+    """Return all phases of a training; none if the model has no parameters. The kernel is read only for a field
     loss."""
     if next(data[0].model.parameters(), None) is None:
         return []
@@ -50,7 +50,7 @@ def training_phases(data: Sequence[TrainingData], kernel_file: Path) -> list[Pha
 
 
 def one_step_phases(data: Sequence[TrainingData], kernel: SmoothingKernel | None) -> list[Phase]:
-    """Return the phases of training on the rates of single frames: first with the trajectory loss alone, then with all
+    """Return the phases of training on rates of single frames: first with the trajectory loss alone, then with all
     losses."""
     settings = data[0].settings
     if [*import_paths(data[0].definition.model)]:  # terms or networks of the user

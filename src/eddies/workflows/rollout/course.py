@@ -106,7 +106,7 @@ class Course:
     def _store(self, at: float) -> None:
         """Store the frame at the time `at`, and keep the mean kinetic energy <v.v>/2 of its particles."""
         layout, own = self.segments.layout, self.segments.layout.trajectories["model"]
-        # The first step uses the forces of the first frame. Later frames evaluate forces for storing only, so their time
+        # The first step uses the forces of the first frame. Later frames evaluate forces for storing only; this time
         # counts as storing.
         with self.progress.storing() if self.times else nullcontext():
             particles, acceleration = self.method.frame(at)

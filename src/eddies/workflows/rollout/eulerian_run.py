@@ -36,7 +36,7 @@ RUNAWAY_ENERGY = 100.0
 
 
 class EulerianRun:
-    """A fluid on a coarse grid, with or without a closure, that starts at a frame of the truth.
+    """A large-eddy simulation that starts at a frame of the truth: a fluid on a coarse grid, with or without a closure.
 
     The initial state has those modes of the unfiltered velocity that the grid can hold. They are read from the true
     flow, or found from the velocities of the particles. If the equations are for the filtered velocity, these modes are
@@ -137,7 +137,7 @@ class EulerianRun:
                 **saved_rows(grid.decomposition.comm, self.tracers.columns)}
 
     def load_state_dict(self, saved: Checkpoint) -> None:
-        """Inverse of `state_dict`, exact on the same number of ranks; collective."""
+        """Restore a state of `state_dict`; collective. The continued run is exact on the same number of ranks."""
         grid = self.fluid.grid
         self.state = restored_modes(grid, saved, 4)
         self.clock.load_state_dict(saved["clock"])

@@ -102,7 +102,8 @@ class OnDemand(dict):
 
 
 class MeasuredRollout:
-    """An open rollout on one rank, with its measures: spectra, invariants and planes at single frames.
+    """An open rollout on one rank, with its measures at single frames: spectra, invariants of the velocity gradient,
+    and planes of the velocity and the vorticity.
 
     All ranks can compute measures together with `measure`. Any other measure is computed by this rank when it is first
     used, and kept.
@@ -144,8 +145,7 @@ class MeasuredRollout:
 
     @property
     def groups(self) -> dict[str, Any]:
-        """The series that `open_run` offers in addition to the stored ones. Their names are like those of groups of a
-        product."""
+        """The series that `open_run` adds to the stored ones. They have names like those of groups in a product."""
         found: dict[str, Any] = {f"particles/{name}": run for name, run in self.particles.items() if name != "model"}
         for name, run in self.particles.items():
             if self._solver is not None:

@@ -61,7 +61,8 @@ class Method(Protocol):
         """Return the present state by name, as `CheckpointDirectory.write` takes it. No name begins with "rollout"."""
 
     def load_state_dict(self, saved: Checkpoint) -> None:
-        """Continue from a checkpoint, made on any number of ranks; exact on the same number of ranks."""
+        """Continue from a checkpoint that was made on any number of ranks. The continued run is exact on the same
+        number."""
 
 
 @dataclass(frozen=True)

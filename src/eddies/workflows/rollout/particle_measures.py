@@ -133,8 +133,8 @@ class ParticleSpectra:
         self.__dict__.pop("_resolution", None)
 
     def of(self, particles: Frames, frame: int, whose: str) -> np.ndarray:
-        """Return E(k) of the shells 0, 1, ... up to the last shell in which all modes are resolved; shell 1 is always
-        included. `whose` names the particles in `complaints`."""
+        """Return E(k) of shell 0 up to the last shell in which all modes are resolved, and of shell 1 in any case.
+        `whose` names the particles in `complaints`."""
         position, velocity = (particles.read(frame, name).astype(float) for name in ("position", "velocity"))
         with torch.no_grad():
             flow = self._resolution.of(ParticleSet.from_numpy(

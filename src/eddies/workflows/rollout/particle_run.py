@@ -95,7 +95,7 @@ class ParticleRun:
         return complaint
 
     def _allowed_step(self) -> float:
-        """Return the longest step that the resolved velocity allows in the present flow; infinite if it sets no
+        """Return the longest step that the resolved velocity allows in the present flow, or infinity if it sets no
         limit."""
         resolution = self.dynamics.resolution
         if resolution is None or not self.limited:
@@ -112,8 +112,8 @@ class ParticleRun:
                                           "acceleration is not finite" if wrong else None)
 
     def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
-        """Return the particles at a time within the last step, and their acceleration. If terms give a density, the
-        particles have it."""
+        """Return the particles at a time within the last step, and their acceleration. They have the density that terms
+        give."""
         if self._before is None:
             self.particles, rates = self.integrator.rates(self.particles)
             particles = self.particles
@@ -134,7 +134,8 @@ class ParticleRun:
         return Moment.of(self.comm, self.total, self.time, self.particles, rates)
 
     def _count_solves(self) -> None:
-        """Add a row to the table of SOLVES: the solves for the resolved velocity since the last frame."""
+        """Add a row to the table with the columns SOLVES, for the solves for the resolved velocity since the last
+        frame."""
         if self.dynamics.resolution is None:
             return
         solves, self.dynamics.resolution.solves = self.dynamics.resolution.solves, []
@@ -172,7 +173,7 @@ class ParticleRun:
             "outside_training": self._shares_outside, "closure": self._solves}}
 
     def load_state_dict(self, saved: Checkpoint) -> None:
-        """Inverse of `state_dict`, exact on the same number of ranks; collective."""
+        """Restore a state of `state_dict`; collective. The continued run is exact on the same number of ranks."""
         self.particles = restored_particles(saved, self.integrator, self.particles.id.device)
         self._shares_outside, self._solves = (saved["series"][name] for name in ("outside_training", "closure"))
 

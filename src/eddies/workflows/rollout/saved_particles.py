@@ -74,9 +74,9 @@ def particle_state(particles: ParticleSet, integrator: Integrator) -> dict[str, 
 
 
 def restored_particles(saved: Checkpoint, integrator: Integrator, device: torch.device) -> ParticleSet:
-    """Restore the state of `particle_state` and return the particles; collective.
+    """Restore the particles of `particle_state` and the state of the integrator; collective.
 
-    The result is exact on the same number of ranks. On another number the particles move to their slabs, and the
+    The continued run is exact on the same number of ranks. On another number the particles move to their slabs, and the
     neighbour list is built again.
     """
     dynamics = integrator.dynamics
