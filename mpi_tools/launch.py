@@ -33,7 +33,7 @@ EXPLAINED = (2, 75, 130)
 def default_ranks() -> int:
     """Return the number of cores divided by OMP_NUM_THREADS, or EDDIES_RANKS if that is smaller.
 
-    Raises ValueError if one of these is not a whole number of at least 1.
+    Raises ValueError if one of the two variables has a wrong value.
     """
     check_threads()
     most, asked = max(local_cores() // threads(), 1), os.environ.get("EDDIES_RANKS", "").strip()

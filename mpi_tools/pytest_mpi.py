@@ -4,13 +4,13 @@
     def test_sum(comm):
         assert comm.allreduce(1) == comm.size
 
-The pytest process that the user starts (outer) never initialises MPI, because Open MPI 4 cannot start mpirun from a
-process that has initialised it. The outer process starts one `mpirun -n RANKS python -m pytest MODULES` (inner) for all
-selected tests with the same number of ranks, because starting ranks takes longer than most tests. Every rank writes
-JSON lines, from which each test is reported. If the ranks disagree about a test, or the test exceeds its time limit,
-this mpirun ends and a new one runs the following tests. Tests run in the order of their numbers of ranks. Several
-mpirun share the modules with one-rank tests. All ranks of a test have the same `tmp_path`, but not the same
-`tmp_path_factory`.
+The pytest process that the user starts, the outer process, never initialises MPI, because Open MPI 4 cannot start
+mpirun from a process that has initialised it. The outer process starts one `mpirun -n RANKS python -m pytest MODULES`,
+an inner run, for all selected tests with the same number of ranks, because starting ranks takes longer than most tests.
+Every rank writes JSON lines, from which each test is reported. If the ranks disagree about a test, or the test exceeds
+its time limit, this mpirun ends and a new one runs the following tests. Tests run in the order of their numbers of
+ranks. Several mpirun share the modules with one-rank tests. All ranks of a test have the same `tmp_path`, but not the
+same `tmp_path_factory`.
 """
 
 import gc

@@ -15,7 +15,7 @@ EVERY = 8  # steps between two measurements of the speed
 class CourantLimit:
     """Time step with  step * (max(|u| + |v| + |w|) + sqrt(3) c) <= courant * dx.
 
-    The step is the largest of largest * 2^-m, m = 0, 1, ..., that satisfies this. `sound_speed` is c for a stepper that
+    The step is the largest of largest * 2^-m, m = 0, 1, ..., within this limit. `sound_speed` is c for a stepper that
     treats sound explicitly, and 0 for others. The factor sqrt(3) belongs to sound that travels along the diagonal of a
     cell. The speed of the flow is measured every EVERY steps.
     """

@@ -40,7 +40,7 @@ def _gaussian_solenoidal(grid: SpectralGrid, seed: int) -> tuple[np.ndarray, np.
 
 
 def _with_spectrum(grid: SpectralGrid, velocity: np.ndarray, energy: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return the velocity with its shells scaled from their spectrum `energy` to the spectrum `target`."""
+    """Scale each shell of modes so that the spectrum `energy` of the velocity becomes `target`; return the result."""
     scale = np.sqrt(np.divide(target, energy, out=np.zeros(len(energy)), where=energy > 0))
     return (velocity * scale[grid.shell_number]).astype(grid.complex)
 

@@ -49,8 +49,8 @@ def release(decomposition: SlabDecomposition, seed: int, total: int, placement: 
 class FilteredField:
     """Gaussian-filtered velocity at arbitrary points, and in a compressible flow also the filtered density.
 
-    A `filter_width` of 0 means no filter. Points may lie in this rank's slab or in the `margin` planes on each side of
-    it. So a particle may cross at most `margin` planes in a step.
+    A `filter_width` of 0 means no filter. `interpolation` is the `kind` of SplineInterpolation. Points may lie in this
+    rank's slab or in the `margin` planes on each side of it. So a particle may cross at most `margin` planes in a step.
     """
 
     def __init__(self, grid: SpectralGrid, filter_width: float, interpolation: str, margin: int = 1) -> None:

@@ -31,7 +31,7 @@ HISTOGRAM_BINS, HISTOGRAM_REACH = 41, 5.0
 class LossWeights:
     """Weights of the losses. The trajectory loss has weight 1.
 
-    `field` is the weight of Eq. 13, and `velocity_kl` and `acceleration_kl` are those of Eq. 14 for the two quantities.
+    `field` is the weight of Eq. 13. `velocity_kl` and `acceleration_kl` are those of Eq. 14 for these two quantities.
     The power loss is not part of Eq. 15.
     """
 
@@ -300,22 +300,21 @@ class ForceTrainer:
         return power.square().sum() / self.comm.size  # every rank has the whole, so its share is an equal part
 
     def _field_share(self, frame: TrainingFrame, rows: Tensor, error: Tensor, inside: Tensor) -> Tensor:
-        """Return this rank's share of Eq. 13: the mean square of an error of the kernel average <.> at grid points.
+        """Return this rank's share of the field loss, Eq. 13: a mean square error of kernel averages <.> on a grid.
 
         The error of the velocity is divided by the time step and by the rms acceleration. The mean is over the grid
         points of all ranks with the indices `inside`. `rows` are the indices of the particles whose accelerations a
         were predicted, and `error` (k, 3) is a - a_true.
 
         Without a filtered velocity, the error is <a - a_true> at the true positions. Here the predicted velocity after
-        a step is compared with the true one, both averaged by the kernel, so the error of the kernel cancels. This
-        error is far larger than the change of velocity in a step, and the force cannot correct it.
+        a step is compared with the true one, both averaged by the kernel, so the error of the kernel cancels. The error
+        of the kernel is far larger than the change of velocity in a step, and the force cannot correct it.
 
         With a filtered velocity u one frame later, the error is (<v> - u) / span. v = v_before + span a is the model's
         velocity after a midpoint step of length span, from the frame before to the frame after. True accelerations are
         centred differences, so v = v_true + span (a - a_true), where v_true is the true velocity in the frame after.
         The positions at the end of the step are the true ones, because a midpoint step computes them from the velocity
-        in its middle, not from a. The error is therefore <a - a_true> plus the error of the kernel, (<v_true> - u) /
-        span.
+        in its middle, not from a. So the error is <a - a_true> plus (<v_true> - u) / span, the error of the kernel.
         """
         within, later, points = frame.within(self.kernel), frame.later, self._points[inside]
         change = torch.zeros_like(frame.acceleration).index_add(0, rows, error)

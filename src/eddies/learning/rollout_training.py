@@ -46,10 +46,10 @@ class TrainingWindow:
 class RolloutTrainer:
     """Trains a model on rollouts from true initial states.
 
-    Every training step draws one window at random, which depends on (seed, step) alone, and advances all particles of
-    the window by the integrator of the simulation. The loss of a frame is <|v - v_true|^2> / <|v_true - v_start|^2>,
-    with means <.> over all particles. It is 1 for particles without acceleration, so all frames count alike. A density
-    whose rate is learned has a loss of the same form.
+    Every training step draws a window at random and advances all its particles by the integrator of the simulation. The
+    random choice depends on (seed, step) alone. The loss of a frame is <|v - v_true|^2> / <|v_true - v_start|^2>, with
+    means <.> over all particles. It is 1 for particles without acceleration, so all frames count alike. A density whose
+    rate is learned has a loss of the same form.
 
     The energy loss is the squared error of the kinetic energy in a band of wavenumbers, averaged over the bands. The
     error is in units of the energy that the band loses on average from the start to the frame. This loss is needed

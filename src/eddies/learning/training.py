@@ -70,7 +70,7 @@ class Training:
         self._begin(0)
 
     def _begin(self, number: int) -> None:
-        """Begin a phase."""
+        """Begin the phase of this number, counted from 0."""
         self.phase_number, self.best_error, self.best, self.best_at = number, np.inf, self._weights(), 0
         if self.running:
             self.optimizer = Adam(self.comm, self.model.parameters(), self.phase.steps, *self.phase.rates)

@@ -126,7 +126,7 @@ class SpectralGrid(ModeOperators):
         return self._planes_to_columns(results)
 
     def squares(self, vector: np.ndarray) -> np.ndarray:
-        """Return the modes (6, kz, ky_local, kx) of u_i u_j, ij = xx, yy, zz, xy, xz, yz; `vector` are those of u."""
+        """Return the modes (6, kz, ky_local, kx) of u_i u_j, ij = xx, yy, zz, xy, xz, yz, given those of u."""
         def product(u: np.ndarray, out: np.ndarray) -> None:
             for row, (i, j) in enumerate(SYMMETRIC):
                 np.multiply(u[i], u[j], out=out[row])
