@@ -123,8 +123,7 @@ class Context:
         return other
 
     def column(self, name: str) -> Tensor:
-        """Return the column "velocity" (s, 3) or "density" (s,) of the owned particles, then of the ghosts; collective.
-        """
+        """Return the column "velocity" (s, 3) or "density" (s,) of owned particles, then of ghosts; collective."""
         around = self.local.neighborhood
         if name not in self._columns:
             owned = self.density if name == "density" else getattr(self.particles, name)

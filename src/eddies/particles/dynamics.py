@@ -27,8 +27,8 @@ class ParticleDynamics:
     model : the terms. If no term reads pairs or the resolved velocity, there is no neighbour list and no halo, and
         particles do not change rank.
     skin : extra radius of neighbour list and halo. Both are rebuilt when some particle has moved by half the skin.
-    dtype : precision of pair arithmetic and of the resolved velocity; by default that of the positions. Positions stay
-        in double precision; only their differences are converted.
+    dtype : precision of the resolved velocity and of computations with pairs; by default that of the positions.
+        Positions stay in double precision; only their differences are converted.
     fixed_ranks : whether particles keep their rank and row, as gradients through a few steps require. The halo then
         widens by the largest distance of a particle from its slab.
     drift : if a term reads the resolved velocity, a particle may be at most skin/2 + `drift` outside its slab.

@@ -22,7 +22,7 @@ class Limits:
 
 
 def find_fault(particles: ParticleSet, limits: Limits, box: PeriodicBox, step: int, rank: int) -> str | None:
-    """Describe the first particle of this rank whose state is not finite or exceeds the limits; None without one.
+    """Describe the first particle of this rank whose state is not finite or exceeds the limits; None if all are sound.
 
     The description contains step, rank, particle id, position, velocity, density and the nearest particle of the rank.
     """

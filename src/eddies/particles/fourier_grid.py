@@ -26,9 +26,9 @@ class FourierGrid(ModeOperators):
 
     Modes have |k_i| <= `resolved` for each component of k, in units of the smallest wavenumber. Fields are real tensors
     (c, z_local, y, x), modes complex ones (c, kz, ky, kx) as in `SpectralGrid`, on the host and in the precision of
-    `dtype`. Values at positions are in double precision. Positions (n, 3) lie in this rank's
-    slab or at most `reach` outside it; `reach` is the thickness of `margin` grid planes. Methods that convert between
-    particles, fields and modes are collective, also in the backward pass.
+    `dtype`. Values at positions are in double precision. Positions (n, 3) lie in this rank's slab or at most `reach`
+    outside it; `reach` is the thickness of `margin` grid planes. Methods that convert between particles, fields and
+    modes are collective, also in the backward pass.
     """
 
     def __init__(self, decomposition: SlabDecomposition, resolved: int, margin: int = 1,

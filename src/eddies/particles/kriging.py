@@ -47,8 +47,8 @@ def interpolated(pairs: Pairs, support: float, filter_width: float, values: Tens
     `values` (s, c) holds f_j of each particle j that the rank sees. Both results are sums sum_j w_j f_j with weights
     w = K^-1 b of `kriging_weights`. For the field b_j is C(|x - x_j|). For the gradient b_j is the derivative of
     C(|x - x_j|) with respect to the point x. The weights of the field add up to one and those of the gradient to zero,
-    so a constant field is exact. The result is NaN where the equations cannot be
-    solved, and zero where no particle lies within the support.
+    so a constant field is exact. The result is NaN where the equations cannot be solved, and zero where no particle
+    lies within the support.
     """
     _, weights = kriging_weights(pairs, support, filter_width, sited=False)
     sums = torch.from_numpy(compiled.weighted_sums(pairs.offsets.numpy(), pairs.sender.numpy(), None,

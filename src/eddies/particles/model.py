@@ -110,7 +110,7 @@ class LagrangianModel(nn.Module):
 
     @property
     def networks(self) -> list[PairTerm]:
-        """The terms that evaluate a neural network for each pair. Their method `features` returns the inputs."""
+        """The terms that evaluate a neural network for each pair. Their method `features` returns its inputs."""
         return [term for term in self.terms.values() if isinstance(term, PairTerm) and hasattr(term, "features")]
 
     @property

@@ -28,13 +28,12 @@ def expected_moment(neighbors: float, cutoff: float) -> float:
 
 
 def products(a: Tensor, b: Tensor) -> list[Tensor]:
-    """Return the six entries a_i b_j, each (m,), of a b^T. Vectors a, b (3, m) are parallel, so a b^T is symmetric."""
+    """Return the six entries a_i b_j, each (m,), of a b^T for parallel vectors a, b (3, m). So a b^T is symmetric."""
     return [a[i] * b[j] for i, j in ENTRIES]
 
 
 def invert_symmetric(matrix: Tensor) -> Tensor:
-    """Return the inverses of n symmetric positive definite 3 x 3 matrices, in closed form: six entries of each, (6, n).
-    """
+    """Return the inverses (6, n) of n symmetric positive definite 3 x 3 matrices, given by their six entries (6, n)."""
     xx, xy, xz, yy, yz, zz = matrix
     cofactors = torch.stack([yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy, xx * zz - xz * xz,
                              xy * xz - xx * yz, xx * yy - xy * xy])

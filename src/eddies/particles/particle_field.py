@@ -123,7 +123,7 @@ class ParticleField:
     @torch.no_grad()
     def fitted(self, kernel: SmoothingKernel, degree: int, mean_volume: float,
                receivers: Tensor) -> tuple[Tensor, Tensor]:
-        """Fit the velocity (k, 3) and its gradient (k, 3, 3) by moving least squares at any points x of this rank.
+        """Estimate the velocity (k, 3) and its gradient (k, 3, 3) by moving least squares at any points x of this rank.
 
         The result for each component A is the value and gradient at x of a polynomial p of this degree, 1 or 2, in
         (x_j - x)/h. h is the support of the kernel W, which must not be negative. p minimises
@@ -153,7 +153,7 @@ class ParticleField:
 
     def _sums(self, kernel: SmoothingKernel, kind: str, components: int, position: Tensor, count: int,
               scalars: tuple[Tensor, ...] = ()) -> Tensor:
-        """Return the library's sums `kind` over the neighbours of the first `count` positions, (components, count)."""
+        """Return the library's sums of a `kind` over neighbours of the first `count` positions, (components, count)."""
         space = PairSpace(self._box.length, self._box.periodic_z, kernel.support, 1.0, 1.0, False)
         summand = CompiledSum(kind, _for_library(kernel), scalars=scalars, reads_velocity=False)
         sums, = compiled_sums(space, [summand], [torch.ones(components)], position, None,

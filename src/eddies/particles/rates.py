@@ -21,8 +21,8 @@ class Rates:
     density_rate : (n,), rate of change of the density.
     density : (n,), part of rho - rho_0, with the mean density rho_0, from a term that gives the density, not its rate.
     force_modes : Fourier modes (3, kz, ky, kx) of an acceleration on the grid of the resolved velocity.
-    pressure_modes : Fourier modes (kz, ky, kx) of p / rho_0 for a pressure p. The density gets the part p / c^2, with
-        the speed of sound c.
+    pressure_modes : Fourier modes (kz, ky, kx) of p / rho_0 for a pressure p. p / c^2 is added to the density;
+        c is the speed of sound.
     shift_velocity : (n, 3), velocity of the particles relative to the fluid, dx/dt = v + shift_velocity.
     shift_acceleration : (n, 3), rate of change of the fluid velocity v at a particle due to the shift.
 

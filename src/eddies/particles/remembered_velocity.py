@@ -25,11 +25,12 @@ class RememberedVelocity:
     """Estimates the resolved velocity frame by frame, with a forecast from each frame to the next.
 
     The correlation of a mode with its forecast f is assumed to decay in a time dt to beta = exp(-k u' dt / 2C), where
-    u' is the rms of a velocity component. The prior then has the mean beta f and the variance
-    beta^2 V + (1 - beta^2) P.  P is the prior variance in the solver, and V is the variance of the previous estimate:
-    1/V = N/e + 1/(variance of its prior) for N evenly spread particles. e is the energy of a velocity component that
-    the solver expects beyond its modes. So modes that few particles determine collect the information of several
-    frames. Forecasts solve the Navier-Stokes equations for the velocity before the filter, in the modes of the solver.
+    u' is the rms of a component of the velocity before the filter. The prior then has the mean beta f and the variance
+    beta^2 V + (1 - beta^2) P, where P is the prior variance in the solver and V the variance of the previous estimate.
+    For N evenly spread particles, 1/V = N/e + 1/(variance of the previous prior). e is the energy of a velocity
+    component that the solver expects beyond its modes. So modes that few particles determine collect the information
+    of several frames. Forecasts solve the Navier-Stokes equations for the velocity before the filter, in the modes of
+    the solver.
 
     Parameters
     ----------

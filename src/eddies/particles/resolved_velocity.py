@@ -235,8 +235,9 @@ class ResolvedVelocity:
     def remember(self, time: float, flow: ResolvedFlow, force: Tensor | None) -> None:
         """Store a flow and its rate of change for later predictions.
 
-        `force` are the modes (3, kz, ky, kx) of the particles' acceleration. The rate is du/dt = P[force - div(uu)], P
-        the solenoidal projection, in the frame that moves with the particles' mean velocity.
+        `force` are the modes (3, kz, ky, kx) of the particles' acceleration; None: no acceleration. The rate is
+        du/dt = P[force - div(uu)], P the solenoidal projection, in the frame that moves with the particles' mean
+        velocity.
         """
         rate = self.equations.projected((0 if force is None else force.detach()) - flow.convection)
         self._moments = [moment for moment in self._moments if moment.time != time][-1:]
@@ -247,12 +248,12 @@ class ResolvedVelocity:
         """Predict the modes at a time; None without earlier evaluations.
 
         The nearer of the last two evaluations at different times is extrapolated with the rates of both (Adams and
-        Bashforth). The field moves with the mean velocity (3,) of the particles. Each mode is multiplied by a
-        factor that decreases with its expected error. A velocity u' = `speed`, the rms of a component, turns the phase
-        of a mode by theta = k u' dt in a time dt. The relative error of the prediction is then (5/12)
-        theta^3; its rms over normally distributed velocities is 1.6 theta^3. The factor 1 / (1 + (2 theta)^6) removes
-        modes that velocities of two or three u' would spoil. A wrong mode is worse than a missing one: the solve
-        corrects it only near particles, and it grows elsewhere.
+        Bashforth). The field moves with the mean velocity (3,) of the particles. Each mode is multiplied by a factor
+        that decreases with its expected error. A velocity u' = `speed`, the rms of a component, turns the phase of a
+        mode by theta = k u' dt in a time dt. The relative error of the prediction is then (5/12) theta^3; its rms over
+        normally distributed velocities is 1.6 theta^3. The factor 1 / (1 + (2 theta)^6) removes modes that velocities
+        of two or three u' would spoil. A wrong mode is worse than a missing one: the solve corrects it only near
+        particles, and it grows elsewhere.
         """
         if not self._moments:
             return None
@@ -315,8 +316,9 @@ class ResolvedVelocity:
         """Return a function that turns the gradient of a loss with respect to the modes u at the minimum into the
         gradient with respect to the descent d(u; x, v) there.
 
-        d vanishes at the minimum and changes with u by -A, so du = A^-1 dd (implicit function theorem). A is symmetric
-        in the inner product that weights modes by their multiplicity m. Its transpose is therefore m A (1/m).
+        d vanishes at the minimum, and its derivative with respect to u is -A. So a change dd of the descent moves the
+        minimum by du = A^-1 dd (implicit function theorem). A is symmetric in the inner product that weights modes by
+        their multiplicity m. Its transpose is therefore m A (1/m).
         """
         grid, count = self.grid, float(global_sum(self.grid.decomposition.comm, len(flow.relative_velocity)))
 

@@ -1,8 +1,8 @@
 """Smoothing kernels W(r) of compact support: two kernels of SPH, tabulated ones, and the learned kernel of Eq. 7.
 
 Every kernel has unit integral over space, with W in units of 1/length^3, is nowhere negative, and is exactly zero for
-r >= support. The published form of the learned kernel is the exception: it may be negative, and the loss L_n brings its
-integral only near one. It has a `mean_volume` L^3/N, the V_j of Eq. 6, and its sums are not normalised.
+r >= h, its support. The published form of the learned kernel is the exception: it may be negative, and the loss L_n
+brings its integral only near one. It has a `mean_volume` L^3/N, the V_j of Eq. 6, and its sums are not normalised.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from eddies.particles.terms.term import Coefficient, Term
 from eddies.scene import terms as declared
 
 # The sweeps of the pressure iterate with the operator -laplacian / sum_j |w_ij|. Two or more sweeps reduce an error
-# to an eighth or less if its eigenvalue lies between LEAST / sweeps^2 and 1.
+# to an eighth or less if it belongs to an eigenvalue between LEAST / sweeps^2 and 1.
 LEAST = 2.0
 
 
@@ -22,11 +22,11 @@ class FilteredEquations(Term):
 
         dv/dt = -grad p - div tau + nu laplacian u - C_r (2 u'/d) (v - u),   tau = f (d^2/12) grad u grad u^T
 
-    eddies.particles.kriging has the derivatives of the velocity u and of p. v - u is the difference between a
-    particle's velocity and the neighbours' estimate. u' is the present rms of a component of v, d the filter width and
-    nu the viscosity. f is learned. It is near 1, the value of the gradient model (Leonard 1975; Clark et al. 1979). The
-    force -div tau is -f (d^2/12) d_j d_k u_i d_k u_j. C_r, C_d and C_p are the settings `relaxation`, `solenoidal` and
-    `density`.
+    The derivatives of the velocity u and of p are kriging estimates (eddies.particles.kriging). v - u is the difference
+    between a particle's velocity and the neighbours' estimate. u' is the present rms of a component of v, d the filter
+    width and nu the viscosity. f is learned. It is near 1, the value of the gradient model (Leonard 1975; Clark et al.
+    1979). The force -div tau is -f (d^2/12) d_j d_k u_i d_k u_j. C_r, C_d and C_p are the settings `relaxation`,
+    `solenoidal` and `density`.
 
     p, the pressure divided by rho_0, starts from c^2 (rho/rho_0 - 1) with the particles' own density. `sweeps` steps of
     Chebyshev's iteration then reduce the residual

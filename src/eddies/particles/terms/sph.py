@@ -49,8 +49,8 @@ class Continuity(_SPHTerm):
 
         + 2 delta h c sum_j (m/rho_j) (rho_j - rho_i) (-W'/r).
 
-    delta is the only learned parameter; `diffusion` is its initial value. The term uses its magnitude, since a negative
-    delta would amplify noise.
+    delta is the only learned parameter; `diffusion` is its initial value. The term uses |delta|, since a negative delta
+    would amplify noise.
     """
 
     Settings = declared.Continuity
@@ -96,10 +96,10 @@ class WCSPH(_SPHTerm):
         Pi_ij = (-alpha c mu + beta mu^2)/mean(rho_i, rho_j),   mu = h x.v/(r^2 + 0.01 h^2),   if x.v < 0
 
     with x = x_i - x_j, v = v_i - v_j and r = |x|. The forces on the two particles of a pair are opposite and central:
-    momentum and angular momentum are conserved. In three dimensions Pi acts like a viscosity of about
-    alpha c h / 10. The learned parameters are c_P/c, alpha and beta. The term uses their magnitudes, so that friction
-    dissipates. Pi contains the c of the flow. If it contained c_P, training could combine a large alpha with a small
-    c_P, and the pressure would vanish. gamma is fixed, since it has no effect where the density hardly varies.
+    momentum and angular momentum are conserved. In three dimensions Pi acts like a viscosity of about alpha c h / 10.
+    The learned parameters are c_P/c, alpha and beta. The term uses their magnitudes, so that friction dissipates. Pi
+    contains the c of the flow. If it contained c_P, training could combine a large alpha with a small c_P, and the
+    pressure would vanish. gamma is fixed, since it has no effect where the density hardly varies.
 
     The sum P_i/rho_i^2 + P_j/rho_j^2 gives a poor pressure gradient among random particles. Differences
     (P_j - P_i)/(rho_i rho_j) halve the error at single moments, but they do not conserve energy: the energy grows until
@@ -148,7 +148,7 @@ class WCSPH(_SPHTerm):
 
 
 class TransportVelocity(_SPHTerm):
-    """dx_i/dt = v_i + w_i with a shift velocity w that spreads the particles evenly (Adami, Hu & Adams 2013).
+    """Particles move with dx_i/dt = v_i + w_i; the shift velocity w spreads them evenly (Adami, Hu & Adams 2013).
 
     A constant background pressure p_b that acts for a time delta_t causes w. The velocity v_i changes at the rate
     (w_i.grad) v, so that it remains the velocity of the field at the shifted particle:
