@@ -56,7 +56,7 @@ class TrueParticles:
         self.columns = (*tracers.columns, "acceleration")
 
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Read rows start, ..., stop - 1 of a column, in order of id. ProductError if a value is not finite."""
+        """Read rows start, ..., stop - 1 of a column, in order of id. Raises ProductError if a value is not finite."""
         tracers, at = self._tracers, int(self.frames[frame])
         if column == "acceleration":
             before, after = (tracers.read(at + step, "velocity", start, stop) for step in (-1, 1))
