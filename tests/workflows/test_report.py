@@ -18,6 +18,7 @@ from eddies.workflows.rollout.measured import open_rollout
 from tests.changed_product import changed
 from tests.workflows.stopping import StopAtStep
 from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_model, write_rollout, write_run
+from tests.workflows.test_variant_rows import REALISED, scene_of
 
 pytestmark = pytest.mark.mpi(1)
 
@@ -313,6 +314,17 @@ def test_a_rollout_without_its_ground_truth(comm, tmp_path):
     assert metrics["rollout"]["velocity_error"] is metrics["rollout"]["spectrum_error"] is None
     assert "not compared with the truth: ground_truth.h5 is not here" in page
     assert metrics["rollout"]["turnovers"] > 0 and not figures(tmp_path)
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_only_a_grid_as_fine_as_that_of_the_simulation_repeats_it(comm, tmp_path):
+    """The direct simulation has 24 cells. A coarser grid is faster."""
+    grid, seconds = 'simulation.method = "eulerian"', {"plain": 1.0, "coarse": 2.0, "fine": 5.0}
+    scene = scene_of(tmp_path, ("coarse", grid), ("fine", grid, "eulerian.cells = 24"))
+    found = {name: [REALISED | {"wall_seconds": seconds[name]}] for name in scene.variant}
+    pages = report.Report(tmp_path, "case", dict.fromkeys(seconds, [tmp_path]), {"plain": tmp_path})
+    _, texts = report._compare(scene, pages, report.Page(tmp_path, {}), found, 1, comm)
+    assert json.loads(texts["variants.json"])["simulation_seconds"] == 5.0
 
 
 @pytest.mark.usefixtures("no_figures")
