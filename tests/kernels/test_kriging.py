@@ -32,7 +32,7 @@ def weights(offsets, displacement, width=WIDTH, sited=True):
 @pytest.mark.parametrize("count, width, sited, dtype", [
     (2, WIDTH, True, torch.float64), (37, WIDTH, False, torch.float64), (37, WIDTH, False, torch.float32),
     (120, WIDTH, True, torch.float64), (60, WIDTH, True, torch.float32), (60, WIDTH / 30, True, torch.float64)])
-def test_weights(count, width, sited, dtype):
+def test_weights(library, count, width, sited, dtype):
     """Neighbours up to 1.2 filter widths away, where a series replaces the widest Gaussian, and farther."""
     listed = pairs(count, dtype)
     compiled = weights(listed.offsets, listed.displacement, width, sited)
@@ -75,7 +75,7 @@ def test_too_many_neighbours_give_nan_for_that_receiver_only(library, dtype):
 
 
 @pytest.mark.parametrize("rows, dtype", [(1, np.float64), (3, np.float32), (4, np.float64), (10, np.float32)])
-def test_weighted_sums(rows, dtype):
+def test_weighted_sums(library, rows, dtype):
     """Two fields; receivers with no neighbour up to some vectors of them; the weights of one are NaN."""
     random = np.random.default_rng(3)
     counts = np.array([0, 1, 15, 16, 17, 33, 64, 7, 0])
