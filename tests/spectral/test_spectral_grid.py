@@ -115,3 +115,11 @@ def test_a_product_of_fields_is_that_at_the_grid_points(comm, cells):
     assert largest(quotient - grid.forward((first / (2 + second**2))[None])) < 1e-14
     second_moments = grid.squares(np.concatenate([modes, modes[:1]]))
     assert largest(second_moments[3] - grid.forward((first * second)[None])[0]) < 1e-14
+
+
+@pytest.mark.mpi(1, 2)
+def test_blocks_have_the_value_of_each_grid_point_once(comm):
+    grid = make_grid(comm, 15)  # an odd number of planes on one rank and on the first of two
+    modes = grid.forward(noise(grid, 2)[1])
+    values = np.concatenate([block.reshape(2, -1).copy() for block in grid.blocks(modes, fields=2)], axis=1)
+    assert np.allclose(np.sort(values), np.sort(grid.backward(modes).reshape(2, -1)), rtol=0, atol=1e-13)
