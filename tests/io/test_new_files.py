@@ -14,7 +14,7 @@ import pytest
 from eddies.errors import UserError
 from eddies.io import new_files
 from eddies.io.checksums import FOOTER, find_damage, open_to_read, table_checksum
-from eddies.io.errors import WriteError
+from eddies.io.errors import WriteError, write_error
 from eddies.io.fields import FieldWriter
 from eddies.io.hdf5 import (append_frame, create_product, growing_dataset, in_files, open_product, write_array,
                             write_table)
@@ -248,6 +248,12 @@ def test_a_directory_need_not_be_forced_to_the_disk(comm, tmp_path, monkeypatch)
     with pytest.raises(WriteError), create_product(comm, tmp_path / "b.h5", "frames", {}):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
+
+
+def test_an_unknown_size_is_not_told(tmp_path):
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert "No space left on device: 7 bytes wanted, " in str(write_error(tmp_path / "a", full, 7))
+    assert "wanted" not in str(write_error(tmp_path / "a", full))
 
 
 def content(path):
