@@ -49,10 +49,10 @@ class Method(Protocol):
     """Computes the modes (3, kz, ky, kx) of the particles' velocity minus its mean, frame by frame."""
 
     def of(self, particles: ParticleSet, time: float) -> Tensor:
-        """The modes at a time; collective."""
+        """Return the modes at a time; collective."""
 
     def state_dict(self) -> dict[str, Any]:
-        """State from earlier frames that the next frame needs: tensors of modes, and plain values."""
+        """Return what the next frame needs from earlier frames: tensors of modes, and plain values."""
         return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -81,13 +81,13 @@ class Source:
     ----------
     times : times of the frames.
     spacing : mean distance of the particles.
-    scales : scales of the flow. `filter_width` is NO_FILTER times the spacing for unfiltered velocities. `spacing` is
-        that of so many particles that one frame of them would resolve the modes (`Reconstruction.resolving`).
+    scales : reference scales of the flow, by name. For unfiltered velocities `filter_width` is NO_FILTER times the
+        spacing. `spacing` is that of particles that would resolve the modes in one frame (`Reconstruction.resolving`).
     slab : this rank's part of the box, with the planes of the grid of the modes.
     most : largest number of particles in a frame.
     truth : the ground truth with true fields; None for measured tracks.
     unit : the scene's unit of length, in the unit of the tracks.
-    corner : position in the cube of the origin of the tracks' coordinates, in the unit of the tracks.
+    corner : position of the origin of the tracks' coordinates in the cube, in the unit of the tracks.
     """
 
     def __init__(self, tracks: Tracks | None, tracers: Tracers, settings: Reconstruction, file: File,
@@ -109,7 +109,7 @@ class Source:
             self.unit, self.corner = 1.0, np.zeros(3)
 
     def particles(self, frame: int) -> ParticleSet:
-        """This rank's particles of a frame, with position and velocity; collective."""
+        """Return this rank's particles of a frame, with position and velocity; collective."""
         if self._tracks is not None:
             return particles_on(self.slab, self._tracks.frame(frame))
         columns = self.truth.particles(frame)
@@ -121,7 +121,8 @@ class ReconstructionRun:
 
     Parameters
     ----------
-    source : the particles. methods : one for all particles; with a holdout, also one for those not left out.
+    source : the particles.
+    methods : a method for all particles. With [reconstruction] holdout, also one for the particles that remain.
     solver : solver on the grid of the modes. settings, tracers : sections [reconstruction] and [tracers].
     viscosity, transfer : nu, and the transfer function G of the filter that the particles' velocity has passed.
     """
@@ -143,7 +144,7 @@ class ReconstructionRun:
 
     @property
     def layout(self) -> FrameLayout:
-        """The datasets of the frames. The column `track` of `tracks` names each row's track; it is -1 in empty rows."""
+        """The datasets of the frames. The column `track` of `tracks` is the id of a row's track, -1 in empty rows."""
         values = {name: RECONSTRUCTED[name] for name in self.settings.fields}
         columns = {"track": (), "coordinates": (3,), **{name: (count,) for name, count in values.items()}}
         tracks = {"tracks": TrajectoryLayout(self.source.most, columns)} if self.settings.particles else {}
@@ -182,7 +183,7 @@ class ReconstructionRun:
         self.errors.append(row)
 
     def state_dict(self) -> dict[str, Any]:
-        """The state for a checkpoint, without the frames, which have files of their own."""
+        """Return the state for a checkpoint, without the frames, which have files of their own."""
         state: dict[str, Any] = {"reconstruct": {"errors": self.errors, "of_fields": self.of_fields, "plain": []}}
         for number, method in enumerate(self.methods):
             plain = {}
@@ -195,7 +196,7 @@ class ReconstructionRun:
         return state
 
     def load_state_dict(self, saved: Checkpoint) -> None:
-        """Continue from a checkpoint, made on any number of ranks."""
+        """Continue from a checkpoint that was made on any number of ranks."""
         state = saved["reconstruct"]
         self.errors, self.of_fields = state["errors"], state["of_fields"]
         for number, method in enumerate(self.methods):
@@ -223,10 +224,10 @@ def sorted_rows(comm: Comm, most: int, columns: Mapping[str, np.ndarray]) -> dic
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Write reconstruction.h5: the quantities of [reconstruction] fields on a grid, and errors over time.
 
-    u is the velocity of the tracks, u* = u / G the velocity before their filter (G = 1 without a filter), and P the
-    projection on solenoidal fields. The acceleration along a track is -G P[div(u* u*)] + nu laplacian u + div(u u). The
-    pressure is G p, with the incompressible pressure p of u*. All quantities are in the units of the tracks and contain
-    only the modes that the particles resolve. A stopped reconstruction continues from its newest checkpoint.
+    u is the velocity of the tracks, and u* = u / G is the velocity before their filter (G = 1 without a filter). P is
+    the projection on solenoidal fields. The acceleration along a track is -G P[div(u* u*)] + nu laplacian u + div(u u).
+    The pressure is G p, with the incompressible pressure p of u*. All quantities are in the units of the tracks and
+    contain only the modes that the particles resolve. A stopped reconstruction continues from its newest checkpoint.
     """
     prepare_torch("cpu", comm)
     settings, tracers, directory = scene.reconstruction, scene.tracers, Path(directory)
@@ -281,7 +282,7 @@ def _maker(settings: Reconstruction, tracers: Tracers, viscosity: float, kernel:
 
 
 class Quantities:
-    """The quantities of one frame, made from the modes of the velocity relative to its mean.
+    """The quantities of one frame, made from the modes of the velocity minus its mean.
 
     Parameters
     ----------
@@ -304,13 +305,13 @@ class Quantities:
                 - viscosity * grid.wavenumber_squared * modes)
 
     def on(self, target: SpectralGrid) -> dict[str, np.ndarray]:
-        """The wanted quantities by name, as planes (components, z_local, y, x) of another grid; collective."""
+        """Return the wanted quantities by name, as planes (components, z_local, y, x) of `target`; collective."""
         return self._of(lambda modes: target.backward(regrid(self.grid.spectral, target, as_numpy(
             modes.resolve_conj()))))
 
     @torch.no_grad()
     def at(self, particles: ParticleSet) -> dict[str, np.ndarray]:
-        """The wanted quantities by name, (n, components) at the particles of this rank; collective."""
+        """Return the wanted quantities by name, (n, components) at the particles of this rank; collective."""
         points = self.grid.points(particles.position)
         found = self._of(lambda modes: as_numpy(self.grid.at(modes, points)).T)
         return {name: values.T for name, values in found.items()}
@@ -334,7 +335,7 @@ class Quantities:
 
 def errors_of(modes: Tensor, mean: np.ndarray, tracers: Tracers, grid: FourierGrid, truth: GroundTruth,
               frame: int) -> dict[str, float]:
-    """Normalised L2 errors at a frame: `velocity_error` of the filtered velocity, `gradient_error` of its gradient.
+    """Return normalised L2 errors at a frame: `velocity_error` and `gradient_error` of the filtered velocity.
 
     The ground truth must hold a field at this frame. Collective.
     """

@@ -80,8 +80,10 @@ def split(particles: ParticleSet, share: float) -> tuple[ParticleSet, ParticleSe
 
 
 def validation_error(solver: ResolvedVelocity, modes: Tensor, known: ParticleSet, held_out: ParticleSet) -> float:
-    """Normalised L2 error of modes at the particles that were left out. The modes are those of the velocity minus the
-    mean velocity of the `known` particles. NaN if no particle was left out. Collective."""
+    """Return the normalised L2 error of modes at the particles that were left out; NaN if there are none. Collective.
+
+    The modes are those of the velocity minus the mean velocity of the `known` particles.
+    """
     comm = solver.grid.decomposition.comm
     wanted = held_out.velocity - mean_over_ranks(comm, known.velocity)
     missed = solver.grid.at(modes, solver.grid.points(held_out.position)) - wanted
@@ -90,9 +92,10 @@ def validation_error(solver: ResolvedVelocity, modes: Tensor, known: ParticleSet
 
 def slabs_for(comm: Comm, tracers: Tracers, resolved: Tracers, filter_width: float,
               kolmogorov_length: float) -> SlabDecomposition:
-    """Slabs of a grid for the modes that the tracers `resolved` would resolve.
+    """Return the slabs of a grid for the modes that the tracers `resolved` would resolve.
 
-    If the spectrum of the flow ends at lower wavenumbers, the grid has fewer planes, but at least those of `tracers`.
+    If the spectrum of the flow ends at lower wavenumbers, the grid has fewer planes, but at least as many as for
+    `tracers`.
     """
     highest = resolved_wavenumber(resolved.spacing, filter_width, kolmogorov_length)
     planes = 2 * math.ceil(CELLS_PER_WAVENUMBER / 2 * highest)

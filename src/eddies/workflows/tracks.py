@@ -1,4 +1,4 @@
-"""Ground truth of measured tracks: scales, velocities by splines, and fields by least squares."""
+"""Make the ground truth of measured tracks: scales, velocities by splines, and fields by least squares."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def with_tracks(scene: Scene, comm: Comm) -> Scene:
 
 def _unfit(settings: Tracks, learned: Sequence[str], wanted: Reconstruction | None, model: Model | None,
            simulation: Simulation | None, eulerian: Eulerian | None) -> Iterator[str]:
-    """Yield a message for each setting that cannot be used with tracks. `learned` are those of the sections [kernel],
+    """Yield a message for each setting that cannot be used with tracks. `learned` names those sections among [kernel],
     [model] and [simulation] that the scene has."""
     if wanted is not None:
         if settings.viscosity is None and (wanted.method == "memory" or "acceleration" in wanted.fields):
@@ -125,10 +125,11 @@ def _sections_of(settings: Tracks, learned: bool) -> dict[str, Flow | Tracers]:
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Write ground_truth.h5 of measured tracks; all ranks call it.
 
-    Its filtered fields are those of the resolved velocity, which regularised least squares find in the velocities of
-    the tracks. If the tracks follow the unfiltered flow, the filter is applied to these fields; if the scene has a
-    model, the particles of the product are then FilteredTracers. The dissipation rate is the value of the literature
-    for the measured velocity and integral scale (`dissipation_constant`).
+    The filtered fields are those of the resolved velocity, which regularised least squares find in the velocities of
+    the tracks. If the tracks follow the unfiltered flow, the filter is applied to these fields. If the scene then has
+    [kernel], [model] or [simulation], the particles of the product are FilteredTracers instead of the tracks. The
+    dissipation rate is the value of the literature for the measured velocity and integral scale
+    (`dissipation_constant`).
     """
     tracers, tracks, filtered = scene.tracers, TrackFrames(comm, scene.tracks), scene.tracks.filtered
     viscosity, follows = scene.flow.viscosity, tracers.filtered and not filtered
@@ -140,7 +141,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                  "viscosity": viscosity, **measured_scales(comm, first, second, times[1])}
     width = tracers.filter_width if filtered else NO_FILTER * spacing
     found = {"kolmogorov_length": 0.0} | reference
-    # The first pass has no Kolmogorov length. The second pass uses the one that the first pass found in its prior.
+    # The first pass does not know the Kolmogorov length. The prior of the second pass uses that of the first pass.
     for resolved in (own, settings.resolving(own, filtered))[:2 if viscosity > 0 else 1]:
         slab = slabs_for(comm, own, resolved, width, found["kolmogorov_length"])
         particles = particles_on(slab, tracks.frame(0))
@@ -213,7 +214,7 @@ class FrameFlow:
 
     Parameters
     ----------
-    grid, modes : the velocity relative to the mean of the `particles`, (3, kz, ky, kx).
+    grid, modes : modes (3, kz, ky, kx) of the velocity minus the mean velocity of the `particles`, and their grid.
     filtered, filter_width : whether the particles follow the filtered velocity, and the width of the filter.
     """
 
@@ -230,12 +231,12 @@ class FrameFlow:
 
     @torch.no_grad()
     def at(self, position: np.ndarray) -> np.ndarray:
-        """The filtered velocity (n, 3) at positions on this rank; collective."""
+        """Return the filtered velocity (n, 3) at positions (n, 3) on this rank; collective."""
         return as_numpy(self.grid.at(self.filtered, self.grid.points(torch.from_numpy(position)))) + self.mean
 
     def scales(self, viscosity: float) -> dict[str, float]:
-        """The scales of `turbulence_scales`, and `dissipation_rate` eps = C_eps u'^3 / L. C_eps and Re_lambda depend on
-        each other, so both are found by iteration."""
+        """Return the scales of `turbulence_scales`, with the `dissipation_rate` eps = C_eps u'^3 / L. C_eps and
+        Re_lambda depend on each other, so both are found by iteration."""
         cutoff = self.grid.resolved
         found = turbulence_scales(self.energy, 0.0, 0.0, cutoff)
         speed, length = found["velocity_rms"], found["integral_scale"]
@@ -249,7 +250,8 @@ class FrameFlow:
 class FilteredTracers:
     """Particles that follow the filtered velocity of reconstructed fields, by Heun's method from frame to frame.
 
-    They start at the tracks of the first frame, of which `columns` holds this rank's rows. All methods are collective.
+    They start at the positions of the tracks in the first frame. `columns` holds this rank's rows of that frame. All
+    methods are collective.
     """
 
     def __init__(self, slab: SlabDecomposition, columns: Mapping[str, np.ndarray]) -> None:
@@ -258,7 +260,7 @@ class FilteredTracers:
         self._now = migrate(slab, {"id": first + np.arange(len(columns["id"])), "position": columns["position"]})
 
     def follow(self, flow: FrameFlow, step: float) -> tuple[int, dict[str, np.ndarray]]:
-        """Move the particles by a time `step`, 0 in the first frame, to the time of a flow.
+        """Move the particles by a time `step` to the time of `flow`; `step` is 0 in the first frame.
 
         Returns the id of this rank's first row, and its rows of position and velocity in order of id.
         """
