@@ -90,7 +90,7 @@ def test_inputs_and_outputs_of_terms():
 @pytest.mark.parametrize("changes, message", [
     (dict(terms=("pressure", "pressure")), 'terms = ["pressure", "pressure"]: must be one or more terms with'),
     (dict(terms=("presure",)), "did you mean pressure?"),
-    (dict(terms=("pressure",), preset="wcsph"), "the list is given twice; remove one of the two"),
+    (dict(terms=("pressure",), preset="wcsph"), "both keys give the terms; remove one of the two"),
     (dict(terms=("pressure",), settings={"pairs": {}}), "[model.pairs]: no such term; the terms are pressure; remove"),
     (dict(terms=("pairs",), settings={"pairs": Pressure()}), "[model.pairs]: must be settings of the class"),
     (dict(terms=("pairs",), settings={"pairs": 3}), "model.pairs = 3: must be a section"),
@@ -204,4 +204,5 @@ def test_another_list_on_the_command_line_replaces_that_of_the_file(tmp_path):
     assert kept.settings["pairs"].hidden == (8, 8)
     refused("[model.pairs]: no such term",
             lambda: read(tmp_path, written, "model.preset=resolved", "model.pairs.hidden=[4]"))
-    refused("with terms = ", lambda: read(tmp_path, written, "model.preset=resolved", 'model.terms=["pressure"]'))
+    refused("both keys give the terms",
+            lambda: read(tmp_path, written, "model.preset=resolved", 'model.terms=["pressure"]'))

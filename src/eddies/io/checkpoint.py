@@ -172,7 +172,7 @@ class CheckpointDirectory:
 class Guard:
     """Writes the checkpoints that are due, and stops the run on request. All methods are collective.
 
-    `of`, such as " of the training", follows the step number in the message about a stop.
+    Messages give the step number followed by `of`: "step 40 of the training" if `of` is " of the training".
     """
 
     def __init__(self, comm: MPI.Comm, directory: Path, fingerprint: str, stop: StopRequest | None,

@@ -43,8 +43,8 @@ class Model(Section):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.preset is not None and self.terms is not None:
-            raise self.problem("preset", f"with terms = {quoted(self.terms)} the list is given twice; remove one of "
-                               "the two")
+            raise self.problem("preset", f"terms = {quoted(self.terms)} is given too, and both keys give the terms; "
+                               "remove one of the two")
         if self.path is not None and self.path.startswith(BUILT_IN_PREFIX) and not self.weights_file.is_file():
             raise self.problem("path", "must be a run directory, a model.h5, or one of "
                                f"{', '.join(built_in_weights())}")

@@ -243,8 +243,8 @@ class Scene(Section):
         for stage in stages:
             if stage not in self.stages:
                 if self.sets:
-                    raise SceneError(f"{self.name}: `eddies {stage}` works on one set of tracers; choose it by the "
-                                     f"key set of [tracers]: {', '.join(self.sets)}")
+                    raise SceneError(f"{self.name}: `eddies {stage}` works on one set of tracers; add set = NAME "
+                                     f"to [tracers]; NAME is one of: {', '.join(self.sets)}")
                 if stage == "train" and self.model is not None and self.simulation is not None:
                     raise SceneError(f'{self.name}: [simulation] method = "{self.simulation.method}" needs no trained '
                                      'model; set method = "learned" to train one')
@@ -295,7 +295,7 @@ class Scene(Section):
             yield "must be a scene without variants and realisations of its own"
         elif variant.sets:
             yield (f"works on one set of tracers; choose it by the key {VARIANT}.{name}.tracers.set, or for all "
-                   f"variants by the key set of [tracers]: {', '.join(variant.sets)}")
+                   f"variants by set = NAME in [tracers]; NAME is one of: {', '.join(variant.sets)}")
         elif variant.simulation is None or self.simulation is None:
             yield "variants are compared by their rollouts; add [simulation] to the scene and to its variants"
         else:

@@ -178,7 +178,7 @@ class DensityFlux(NetworkSettings):
 
     @property
     def reads(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Pairs, and the density if the network or the sign needs it."""
+        """Pairs; also the density if the network has it as an input or if the key `sign` is true."""
         return ("pairs", "density") if self.sign or "density" in self.inputs else ("pairs",)
 
 

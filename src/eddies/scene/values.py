@@ -42,7 +42,7 @@ class KeyProblem(SceneError):
         self.section, self._parts = section, (key, problem)
 
     def within(self, section: str) -> "KeyProblem":
-        """Return the same problem under another section name."""
+        """Return the same error with another section name in the message."""
         return KeyProblem(section, *self._parts)
 
 

@@ -244,8 +244,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             "turnovers": span / stretches[0].turnover})
         for name, table in tables.items():
             write_table(file, f"trials/{name}", table)
-    log.info("find-step: found %s with %s %.4g, %.3g s per turnover. Half of it changes the final velocity by %.4f "
-             "of its rms; the error is then %.4f", found.step.integrator,
+    log.info("find-step: found %s with %s %.4g, %.3g s per turnover. With half the value the final velocity "
+             "differs by %.4f of its rms, and the error is %.4f", found.step.integrator,
              "Courant number" if settings.on_grid else "step", found.step.size, found.seconds, difference, half.error)
 
 

@@ -67,8 +67,8 @@ def with_tracks(scene: Scene, comm: Comm) -> Scene:
     found = in_files(comm, settings.file, lambda: _sections_of(settings, learned))
     for name, own in found.items():
         if getattr(scene, name) not in (None, own):
-            raise SceneError(f"[{name}]: does not fit [tracks], which takes the place of this section; remove it (in "
-                             f"the scene.toml of a run: --unset {' --unset '.join(found)})")
+            raise SceneError(f"[{name}]: does not fit [tracks], which takes the place of this section; remove it, or "
+                             f"add --unset {' --unset '.join(found)} if the scene is the scene.toml of a run")
     return replace(scene, **found, variant={name: replace(each, **found) for name, each in scene.variant.items()})
 
 

@@ -96,7 +96,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
               if "pressure_gradient_error" in errors else "")
     since = ("end of the training window" if own is not None
              else "release of the tracers; trained on other ground truths")
-    log.info("model: a-priori acceleration error %.3f%s, measured a time of %.3g after the %s",
+    log.info("model: a-priori acceleration error %.3f%s, at the time %.3g after the %s",
              errors["acceleration_error"][-1], beside, errors["delay"][-1], since)
 
 

@@ -75,8 +75,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                  provenance, tables)
     guard.checkpoints.remove()
     errors = tables["errors"]
-    log.info("kernel: errors of averages: velocity %.3f (with a cubic spline %.3f), gradient %.3f (with a cubic spline "
-             "%.3f)",
+    log.info("kernel: errors of the kernel average: velocity %.3f (with a cubic spline %.3f), gradient %.3f "
+             "(with a cubic spline %.3f)",
              errors["velocity_error_learned"], errors["velocity_error_cubic_spline"],
              errors["gradient_error_learned"], errors["gradient_error_cubic_spline"])
     if settings.form in OTHER_FORMS:

@@ -37,7 +37,7 @@ def test_the_field_loss_uses_frames_with_a_field_one_frame_later():
     assert trained_frames(training, FRAMES, range(0, FRAMES, 5)) == ([*range(1, 46)], 49)
     flow = replace(training, field_target="flow")
     assert trained_frames(flow, FRAMES, range(0, FRAMES, 5)) == ([*range(4, 45, 5)], 49)
-    for every, which in ((60, "trained on"), (30, "held out")):
+    for every, which in ((60, "for training has one"), (30, "for validation has one")):
         scene = load_scene("hit-small", ["training.field_target=flow", "training.window=0.5",
                                          f"tracers.field_every={every}"])
         with pytest.raises(SceneError, match=f"field_target.*{which}; lower .tracers. field_every"):

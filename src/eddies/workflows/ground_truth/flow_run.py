@@ -215,7 +215,7 @@ class TracerRun:
             self._finish_interval(progress)
 
     def scales(self, name: str) -> dict[str, float]:
-        """Return the scales of the flow and of the particles of a set at the release."""
+        """Return the scales of the flow, and those of the particles in the set `name`. Both belong to the release."""
         return {"released_at": self.released_at, "sound_speed": self.flow.fluid.sound_speed,
                 **self.sets[name].scales(self.segments)}
 
@@ -298,7 +298,7 @@ def saved_modes(grid: SpectralGrid, modes: np.ndarray) -> Block:
 
 
 def restored_modes(grid: SpectralGrid, saved: Checkpoint, dimensions: int, name: str = "modes") -> np.ndarray:
-    """Return this rank's part of the modes that a checkpoint holds under `name`. The modes are an array with this
-    number of `dimensions`."""
+    """Return this rank's part of the modes (..., kz, ky, kx) that a checkpoint holds under `name`. `dimensions` is the
+    number of dimensions of this array."""
     start, stop = grid.column_starts[grid.decomposition.rank:][:2]
     return saved.read(name, int(start), int(stop), axis=dimensions - 2)

@@ -65,8 +65,8 @@ def trained_frames(settings: Training, frames: int, field_frames: Sequence[int])
     usable = [frame for frame in range(1, last) if not settings.wants_fields or frame + 1 in fields]
     trained, held_out = ([frame for frame in usable if (frame <= learned) == seen] for seen in (True, False))
     if not trained or not held_out:
-        raise SceneError('[training] field_target = "flow": no filtered field is stored one frame after any frame '
-                         f"that is {'held out' if trained else 'trained on'}; lower [tracers] field_every, or set "
+        raise SceneError('[training] field_target = "flow": this needs a filtered field one frame later, but no frame '
+                         f"for {'validation' if trained else 'training'} has one; lower [tracers] field_every, or set "
                          'field_target = "tracers"')
     return trained, held_out[-1]
 

@@ -75,7 +75,7 @@ class GroundTruth:
         The rates are centred differences along trajectories. Raises ValueError for the first and the last frame.
         """
         if not 0 < frame < len(self.times) - 1:
-            raise ValueError(f"frame {frame} of {len(self.times)} has no frames on both sides")
+            raise ValueError(f"frame {frame} of {len(self.times)}: rates need the frame before and the frame after it")
         columns = self.block(frame)
         before, after = (self.block(other, self._evolving) for other in (frame - 1, frame + 1))
         span = self.times[frame + 1] - self.times[frame - 1]

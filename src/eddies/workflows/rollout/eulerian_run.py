@@ -181,10 +181,10 @@ def filter_of(settings: Eulerian, truth: GroundTruth) -> float:
 
 def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float,
                damping: np.ndarray | None) -> Closure | None:
-    """Return the closure of the equations. Their velocity has passed a filter of the width `filter_width`.
+    """Return the closure of the equations for a velocity that has passed a filter of the width `filter_width`.
 
-    If the width is 0, the filter is the sharp cut-off of the grid at its highest wavenumber k_c, and Smagorinsky's
-    length Delta is pi/k_c. `damping` is as in `coarse_fluid`.
+    The width is 0 if the only filter is the sharp cut-off of the grid at its highest wavenumber k_c. Smagorinsky's
+    length Delta is the width, or pi/k_c if the width is 0. `damping` is as in `coarse_fluid`.
     """
     width = filter_width or math.pi / grid.cutoff
     made = {
