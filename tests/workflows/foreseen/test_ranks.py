@@ -11,14 +11,15 @@ from tests.small_scene import TINY, one_model
 
 
 @pytest.mark.mpi(1, 2, 3)
-@pytest.mark.parametrize("neighbors, most", [(100, 3), (200, 2)])
-def test_most_ranks_is_what_the_parts_accept(comm, neighbors, most):
+@pytest.mark.parametrize("override, most", [
+    ("kernel.neighbors=100", 3), ("kernel.neighbors=200", 2), ("simulation.skin=1", 2)])
+def test_most_ranks_is_what_the_parts_accept(comm, override, most):
     from eddies.parallel.halo import HaloError, require_thick_slabs
     from eddies.parallel.slab import SlabDecomposition
     from eddies.scene.scene import BOX_LENGTH
     from eddies.spectral.interpolation import SplineInterpolation
     from eddies.spectral.spectral_grid import SpectralGrid
-    scene = load_scene(TINY, [f"kernel.neighbors={neighbors}"])
+    scene = load_scene(TINY, [override])
     fields, particles = (SlabDecomposition(comm, BOX_LENGTH, planes)
                          for planes in (scene.tracers.cells, scene.tracers.planes))
     assert min(most_ranks(scene).values()) == most
