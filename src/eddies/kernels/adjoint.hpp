@@ -1,10 +1,10 @@
 // Reverse-mode differentiation of formulas of vectors. Each formula is written once: with plain vectors as arguments it
 // is evaluated, with `Place`s as arguments it is differentiated.
 //
-// `let` stores an intermediate result. An expression holds its places by reference and its parts by value; `back` adds
-// the gradient by the expression to the gradients by its places. A stored result passes its gradient on when it is
-// destroyed. C++ destroys in the reverse order of construction, which is the order of the chain rule. A stored result
-// must outlive all expressions that use it.
+// `let` stores an intermediate result. An expression holds its places by reference and its parts by value. `back` takes
+// the gradient with respect to the expression and adds its share to the gradients with respect to the places. A stored
+// result passes its gradient on when it is destroyed. C++ destroys in the reverse order of construction, which is the
+// order of the chain rule. A stored result must outlive all expressions that use it.
 
 #pragma once
 
@@ -35,7 +35,7 @@ struct Constant : Node<Real> {
     void back(Vector<Real>) const {}
 };
 
-// A variable and the gradient by it, initially zero.
+// A variable, and the gradient with respect to it, which is zero at first.
 template <typename Real>
 struct Place : Node<Real> {
     Vector<Real> value;
@@ -71,7 +71,7 @@ struct Named : Place<typename A::Number> {
     ~Named() { made.back(this->by); }
 };
 
-// A stored intermediate result.
+// Store an intermediate result.
 template <typename A>
 inline auto let(const A& made) {
     if constexpr (is_node<A>) return Named<A>(made);
@@ -84,10 +84,11 @@ inline const auto& value_of(const A& a) {
     else return a;
 }
 
-// For two operands of which one is a node: the number type, and both as nodes.
+// The number type of two operands, at least one of which is a node.
 template <typename A, typename B>
 using NumberOf = typename std::conditional_t<is_node<A>, A, B>::Number;
 
+// An operand as a node: a number or a vector becomes a constant.
 template <typename Real, typename A>
 inline decltype(auto) lifted(const A& a) {
     if constexpr (is_node<A>) return (a);
@@ -123,7 +124,7 @@ inline auto spread(const A& a, const Vector&) {
     else return a;
 }
 
-// One or the other, lane by lane.
+// `a` where the mask is set, else `b`, lane by lane.
 template <typename Mask, typename A, typename B>
 inline auto where(Mask mask, const A& a, const B& b) {
     if constexpr (is_node<A> || is_node<B>) {

@@ -1,4 +1,4 @@
-// Particles sorted by place: rows of cells along x, so that the neighbours of a point lie in a few ranges of particles.
+// Particles sorted by place, in rows of cells along x. The neighbours of a point then lie in a few ranges of particles.
 
 #pragma once
 
@@ -24,7 +24,7 @@ struct Turns<float> {
     static Vector<float> all(type one) {
         return (Vector<float>)(BitVector<float>{} + static_cast<std::int32_t>(one));
     }
-    static Vector<float> difference(Vector<float> a, Vector<float> b) {  // of bits
+    static Vector<float> difference(Vector<float> a, Vector<float> b) {  // of the integers in their bits
         using Unsigned __attribute__((vector_size(VECTOR_BYTES))) = std::uint32_t;
         return __builtin_convertvector((BitVector<float>)((Unsigned)a - (Unsigned)b), Vector<float>);
     }
@@ -37,7 +37,7 @@ struct Turns<double> {
     static type of(double fraction) { return fraction; }
     static Vector<double> all(type one) { return Vector<double>{} + one; }
     static Vector<double> difference(Vector<double> a, Vector<double> b) {
-        constexpr double round = 6755399441055744.0;  // 1.5 2^52, added to a number, it rounds it to an integer
+        constexpr double round = 6755399441055744.0;  // 1.5 * 2^52; adding it rounds a number to an integer
         const Vector<double> d = a - b;
         return d - ((d + round) - round);
     }
@@ -45,7 +45,7 @@ struct Turns<double> {
 
 constexpr int CANDIDATES = 64;  // particles that are looked at together, a bit for each
 
-// Number of the first position (count, 3) that is not finite, or -1.
+// Index of the first position (count, 3) that is not finite, or -1.
 inline std::int64_t not_finite(const double* position, std::int64_t count) {
     for (std::int64_t p = 0; p < count; ++p)
         if (!std::isfinite(position[3 * p] + position[3 * p + 1] + position[3 * p + 2])) return p;
@@ -57,18 +57,19 @@ struct Range {
     std::int64_t first, last;
 };
 
-// Another row of cells that touches a row, or the row itself; `step` is where it lies along y and z, -1, 0 or 1.
+// A row of cells that touches a given row, or the given row itself. `step` is its place along y and z relative to the
+// given row: -1, 0 or 1.
 struct NearRow {
     std::int64_t row;
     int step[2];
 };
 
-// Columns of a row, the last one included.
+// A range of columns of a row, the last one included.
 struct Columns {
     std::int32_t first, last;
 };
 
-// Distance of a point from the rows one step back, in place and one step ahead along one axis.
+// Distances of a point along one axis: from the row one step back, from its own row and from the row one step ahead.
 struct Edges {
     double gap[3];
 };
@@ -78,14 +79,15 @@ class Cells {
    public:
     using Turn = typename Turns<Real>::type;
 
-    std::int64_t count = 0, columns = 1, lines = 1, planes = 1;  // columns along x of a row; rows are lines of planes
-    std::vector<std::int32_t> order;                             // the caller's row of each particle
+    std::int64_t count = 0, columns = 1, lines = 1, planes = 1;  // `columns` cells of a row; a plane has `lines` rows
+    std::vector<std::int32_t> order;                             // of each particle, its row in the caller's arrays
     std::vector<Turn> turn[3];
-    std::vector<std::int64_t> start;                             // of each cell, x fastest
-    Real scale[3];                                               // of differences of turns
+    std::vector<std::int64_t> start;                             // first particle of each cell; x varies fastest
+    Real scale[3];                                               // factors from differences of turns to lengths
 
-    // Sort particles (count, 3) of a box of this length, periodic along x and y, and along z if `periodic_z`. Cells are
-    // at least `reach` wide across rows. Points (number, 3) are further arguments of `place`, or null. All are finite.
+    // Sort particles at `position` (particles, 3) in a box of edge `length`, which is periodic along x and y, and along
+    // z if `periodic_z`. Cells are at least `reach` wide along y and z. `points` (number, 3), or null, are other points
+    // for which `place` will be called. All coordinates are finite.
     void arrange(const double* position, std::int64_t particles, const double* points, std::int64_t number,
                  double length, bool periodic_z, double reach) {
         count = particles;
@@ -176,8 +178,8 @@ class Cells {
             }
     }
 
-    // Particles of a nearby row that may be within a distance of a point, given its distances from the edges of its own
-    // row and its fraction of a period along x: up to two ranges.
+    // Find the particles of a nearby row that may be within `distance` of a point. `x` is the point's fraction of a
+    // period along x, and `edges` are its distances from the rows around it. Returns the number of ranges, at most two.
     int within(double x, const Edges* edges, const NearRow& near, double distance, Range* ranges) const {
         double left = distance * distance;
         for (int across = 0; across < 2; ++across) {
@@ -190,7 +192,8 @@ class Cells {
                       static_cast<std::int64_t>((place + half) * static_cast<double>(columns)), ranges);
     }
 
-    // Particles of a row between two columns, to which a period has been added: up to two ranges.
+    // Find the particles of a row in the columns `low` to `high`. A period, the number of columns, has been added to
+    // both. Returns the number of ranges, at most two.
     int pieces(std::int64_t row, std::int64_t low, std::int64_t high, Range* ranges) const {
         const std::int64_t* row_start = &start[row * columns];
         if (high - low + 1 >= columns) {
@@ -209,11 +212,11 @@ class Cells {
         return 2;
     }
 
-    // For each particle of a row: the columns of a nearby row, in the form of `pieces`, in which others may be within a
-    // distance. The last column lies before the first if no column qualifies.
+    // For each particle of a row, find the columns of a nearby row that may hold particles within `distance`. A period
+    // is added to them, as `pieces` needs it. If there are no such columns, the last column lies before the first.
     void columns_within(std::int64_t row, const NearRow& near, double distance, Columns* columns_near) const {
         const std::int64_t cells[2] = {lines, planes}, index[2] = {row % lines, row / lines};
-        double edge[2], slope[2];  // the gap across is the slope times how far a particle is from the edge
+        double edge[2], slope[2];  // gap across = slope * (fraction of the particle - edge)
         for (int across = 0; across < 2; ++across) {
             const int axis = across + 1, step = near.step[across];
             edge[across] = static_cast<double>(index[across] + (step > 0)) * width[axis];
@@ -235,7 +238,7 @@ class Cells {
         }
     }
 
-    // Distance of a point from the rows on both sides of its own.
+    // Find the distances of a point from the rows on both sides of its own.
     void edges(const Place& place, Edges* result) const {
         const std::int64_t cells[2] = {lines, planes};
         for (int across = 0; across < 2; ++across) {
@@ -247,8 +250,8 @@ class Cells {
         }
     }
 
-    // Bits of up to CANDIDATES consecutive particles whose squared distance from a point at these turns is below a
-    // limit.
+    // One bit for each of up to CANDIDATES consecutive particles: whether its squared distance from the point with the
+    // turns `at` is below `limit`.
     std::uint64_t nearer(const Turn* at, std::int64_t begin, int number, Real limit) const {
         using T = Turns<Real>;
         using V = Vector<Real>;
@@ -266,7 +269,7 @@ class Cells {
     }
 
    private:
-    double origin, period[3], width[3];  // of z; and how wide a cell is, in periods
+    double origin, period[3], width[3];  // lowest z; periods; widths of a cell, in periods
     bool wraps[3];
 
     static std::int64_t at_least_one(double number) { return static_cast<std::int64_t>(std::max(number, 1.0)); }

@@ -1,4 +1,4 @@
-// Copies around the one-dimensional transforms of a slab; each function reads and writes the memory once.
+// Copies before and after the one-dimensional transforms of a slab. Each function reads and writes the memory once.
 // tests/kernels/test_copies.py compares them with numpy. Complex numbers are real and imaginary part, one after the
 // other.
 
@@ -7,10 +7,10 @@
 
 extern "C" {
 
-// Blocks (components, planes, lines, width) of complex numbers that ranks exchange. The block of a rank holds the
-// planes or the lines from its entry of `starts` on. kernels/copies.py has the same structure.
+// Blocks (components, planes, lines, width) of complex numbers that ranks exchange. The block of rank r holds the
+// planes or the lines starts[r] ... starts[r + 1] - 1. kernels/copies.py has the same structure.
 struct Blocks {
-    std::int64_t ranks, planes, lines, width;  // the cut axis: its length over all ranks
+    std::int64_t ranks, planes, lines, width;  // along the cut axis, the length over all ranks
     void* const* addresses;                    // (ranks)
     const std::int64_t* starts;                // (ranks + 1)
 };
@@ -21,7 +21,7 @@ namespace {
 
 using Int = std::int64_t;
 
-constexpr Int FEW = 1 << 14;  // complex numbers below which one thread is used
+constexpr Int FEW = 1 << 14;  // with fewer complex numbers, one thread is used
 
 // Addresses of the lines of a plane, for blocks that are cut along lines.
 template <typename Real>
@@ -162,7 +162,7 @@ void fill(Int pairs, Int K, Int cells, Int width, const Real* packed, const Real
     }
 }
 
-// Pairs are in `planes` (pairs, y, x), complex; f and g follow each other.
+// The complex planes (pairs, y, x) hold f + i g; the real planes of f, and those of g, follow each other in memory.
 template <typename Real>
 void split(Int points, const Real* __restrict planes, Real* __restrict f, Real* __restrict g) {
 #pragma omp parallel for simd schedule(static) if (parallel : points > FEW)
@@ -182,7 +182,7 @@ void join(Int points, const Real* __restrict f, const Real* __restrict g, Real* 
 }
 
 // Copy some lines of modes (kz, lines, width) to a column (cells, some lines, width) whose kept modes lie at both ends
-// of z. Successive z of the column are `apart` numbers from each other.
+// of z. Successive z of the column are `apart` complex numbers from each other.
 template <typename Real>
 void fill_column(Int K, Int cells, Int plane, Int count, Int apart, const Real* modes, const Real* factors,
                  Real* column) {

@@ -7,8 +7,8 @@
 
 extern "C" {
 
-// Modes (kz, ky, kx) with kx = 0 ... cutoff, kz = 0 ... cutoff, -cutoff ... -1, and some ky; wavenumbers of each axis.
-// kernels/flow.py has the same structure.
+// Modes (kz, ky, kx) with kx = 0 ... cutoff, kz = 0 ... cutoff, -cutoff ... -1, and `lines` values of ky; kx, ky and kz
+// are the wavenumbers along the axes. kernels/flow.py has the same structure.
 struct Modes {
     std::int64_t cutoff, lines;
     const void *kx, *ky, *kz;
@@ -20,7 +20,7 @@ namespace {
 
 using Int = std::int64_t;
 
-constexpr Int FEW = 1 << 14;  // numbers below which one thread is used
+constexpr Int FEW = 1 << 14;  // with fewer numbers, one thread is used
 
 // Successive fields are `apart` numbers from each other.
 template <typename Real, bool viscous>
@@ -59,7 +59,7 @@ void cross(Int points, Int apart, const Real* fields, Int out_apart, Real* out) 
     }
 }
 
-// function(line, z, y) for all lines of modes along x, in parallel.
+// Call function(line, z, y) for all lines of modes along x, in parallel.
 template <typename Function>
 void for_lines(const Modes& modes, const Function& function) {
     const Int planes = 2 * modes.cutoff + 1;
@@ -91,7 +91,7 @@ void project(const Modes& modes, const Real* vector, Real* result) {
     });
 }
 
-// Position of the factors of a line of modes: those of |kz|.
+// Number of the line of factors for a line of modes. Factors are stored for |kz| only.
 inline Int line_of_factors(const Modes& modes, Int z, Int y) {
     return std::min(z, 2 * modes.cutoff + 1 - z) * modes.lines + y;
 }
@@ -118,7 +118,9 @@ void decays(const Modes& modes, Int components, Int terms, const Real* const* fa
     });
 }
 
-// Components of the state are `size` numbers apart.
+// Add the map of a state (u, sigma), sigma = -i s, along a line: u becomes transverse u + k (excess k.u + elastic
+// sigma), sigma becomes identity sigma - coupling k.u. `along` gets the factor of k, `sums` the rest. Components of the
+// state are `size` numbers apart.
 template <typename Real>
 void add_acoustic_block(Int width, Int size, const Real* __restrict factors, const Real* __restrict state,
                         const Real* __restrict kx, Real ky, Real kz, Real* __restrict sums, Real* __restrict along) {
@@ -149,7 +151,7 @@ void acoustic_blocks(const Modes& modes, Int terms, const Real* const* factors, 
                      Real* result) {
     const Int width = modes.cutoff + 1, size = 2 * (2 * modes.cutoff + 1) * modes.lines * width;
     for_lines(modes, [&](Int line, Int z, Int y) {
-        // (u, v, w, sigma) along the line and the factor of k, separated into real and imaginary parts.
+        // Sums of (u, v, w, sigma) along the line, and the factor of k. Real and imaginary parts are separate.
         thread_local std::vector<Real> memory;
         memory.assign(10 * width, 0);
         Real *const sums = memory.data(), *const along = sums + 8 * width;

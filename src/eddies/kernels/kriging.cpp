@@ -14,25 +14,25 @@ extern "C" {
 
 // Receivers and their neighbours in compressed rows; kernels/kriging.py has the same structure.
 struct Kriging {
-    std::int64_t receivers, pairs, sited;  // the last: whether a receiver is a particle, whose own value counts
+    std::int64_t receivers, pairs, sited;  // sited: whether receivers are particles, with own values
     const std::int64_t* offsets;    // (receivers + 1,)
     const void* displacement;       // (3, pairs), from a neighbour to its receiver
-    double support, noise;          // `noise` of a neighbour at the receiver's own place
+    double support, noise;          // `noise` is that of a neighbour at the receiver's place
     std::int64_t most;              // largest number of neighbours; the weights of a receiver with more are NaN
     std::int64_t scales;
     double slowest;                 // the covariance is sum_m amplitude_m exp(-slowest 2^m r^2), the widest first
     const double* amplitudes;       // (scales,)
     void* own;                      // (10, receivers)
-    void* const* weights;           // ten of (pairs,)
+    void* const* weights;           // ten arrays (pairs,)
 };
 
-// Some rows of these weights, and fields that they are applied to.
+// Some rows of these weights, and the field whose values they multiply.
 struct WeightedSums {
     std::int64_t receivers, rows, columns;
     const std::int64_t *offsets, *senders;
-    const void* const* own;         // rows of (receivers,); null if receivers are not particles
-    const void* const* weights;     // rows of (pairs,)
-    const void* field;              // (seen, columns), receivers first if they are particles
+    const void* const* own;         // arrays (receivers,); null if receivers are not particles
+    const void* const* weights;     // arrays (pairs,)
+    const void* field;              // (particles, columns), the receivers first if they are particles
     void* result;                   // (receivers, columns, rows)
 };
 
@@ -43,6 +43,7 @@ namespace {
 using eddies::Vector;
 using Int = std::int64_t;
 
+// Estimates: the field, its three first and its six second derivatives. One more right-hand side serves the mean.
 constexpr int FUNCTIONALS = 10, SIDES = FUNCTIONALS + 1, MOST_SCALES = 8;
 // Rows and columns of the six second derivatives.
 constexpr int FIRST[6] = {0, 0, 0, 1, 1, 2}, SECOND[6] = {0, 1, 2, 1, 2, 2};
@@ -62,8 +63,8 @@ inline Vector<Real> series_of_exp_minus(Vector<Real> x) {
     return 1 + sum * x;
 }
 
-// exp(-x) for 0 <= x, to a few units in the last place: 2^-n times the series of the remainder; 0 where the result
-// would be denormal.
+// exp(-x) for x >= 0, as 2^-n times the series of the remainder. The error is a few units in the last place. The result
+// is 0 where it would be denormal.
 template <typename Real>
 inline Vector<Real> exp_minus(Vector<Real> x) {
     constexpr bool single = sizeof(Real) == 4;
@@ -80,7 +81,7 @@ inline Vector<Real> exp_minus(Vector<Real> x) {
     return beyond ? Vector<Real>{} : (Vector<Real>)((Bits)fraction + power);
 }
 
-// The covariance as a function of r^2, and its first and second derivative by r^2.
+// The covariance as a function of r^2, and its first and second derivative with respect to r^2.
 template <typename Real>
 struct Covariance {
     Real slowest, amplitudes[MOST_SCALES];
@@ -115,13 +116,13 @@ struct Covariance {
     }
 };
 
-// The equations of a vector of receivers: the lower triangle of the matrix and the right-hand sides, as rows.
+// The equations of receivers, one in each lane: the lower triangle of the matrix and the right-hand sides, as rows.
 template <typename Real>
 class Equations {
    public:
     static constexpr int lanes = eddies::VectorOf<Real>::lanes;
 
-    // Rows are an odd number of vectors apart: otherwise a column would share few sets of the cache.
+    // Rows are an odd number of vectors apart. Otherwise a column would use only a few sets of the cache.
     explicit Equations(Int most)
         : apart_(most | 1), places_(3 * most * lanes), noise_(most * lanes), present_(most * lanes),
           rows_((most + SIDES) * apart_ * lanes), inverse_(most * lanes) {}
@@ -137,7 +138,7 @@ class Equations {
 
    private:
     using V = Vector<Real>;
-    // Size of a tile: its entries, a row and a number of the other side fit the 32 or 16 registers.
+    // Rows and columns of a tile. Its entries, a factor for each column and one for a row fit the 32 or 16 registers.
     static constexpr int TALL = eddies::VECTOR_BYTES == 64 ? 6 : 4, WIDE = eddies::VECTOR_BYTES == 64 ? 4 : 3;
     static_assert(SIDES % TALL > 0);
 
@@ -147,7 +148,7 @@ class Equations {
     V* row(Int i) { return reinterpret_cast<V*>(rows_.data() + i * apart_ * lanes); }
     V& inverse(Int j) { return eddies::vector_at(inverse_.data() + j * lanes); }
 
-    // Positions relative to the receiver, its own first. `present` is 0 where a lane has fewer neighbours than others.
+    // Read positions relative to the receiver, its own first. `present` is 0 where a lane has no more neighbours.
     void read(const Kriging& k, const Int* receiver, int count) {
         const auto* displacement = static_cast<const Real*>(k.displacement);
         const Real reach = static_cast<Real>(1 / (k.support * k.support));
@@ -167,7 +168,7 @@ class Equations {
                     places_.data()[(3 * (j + 1) + axis) * lanes + lane] = -displacement[axis * k.pairs + begin + j];
             }
         }
-        // Neighbours enter and leave at the support, where their noise is 1e4 times that beside the receiver.
+        // Neighbours appear and disappear at the support. Their noise there is 1e4 times that beside the receiver.
         for (Int j = 0; j < size_; ++j) {
             const V q = square(j, 0) * reach, left = 1 - q * q;
             const V least = all<Real>(Real(1e-4));
@@ -183,14 +184,15 @@ class Equations {
     void fill(const Covariance<Real>& covariance, bool sited) {
         for (Int i = 0; i < size_; ++i) {
             V* entries = row(i);
-            for (Int j = 0; j < i; ++j) entries[j] = covariance(square(i, j)) * present(i);  // then j > 0 is, too
+            for (Int j = 0; j < i; ++j) entries[j] = covariance(square(i, j)) * present(i);  // j > 0 is present, too
             if (i > 0) entries[0] *= present(0);
             entries[i] = (covariance(V{}) + noise(i)) * present(i) + (1 - present(i));
             V first, second;
             covariance.derivatives(square(i, 0), first, second);
             row(size_)[i] = sited ? all<Real>(i == 0) : covariance(square(i, 0)) * present(i);
             row(size_ + FUNCTIONALS)[i] = present(i);
-            // By the receiver's place x of C(|x - x_j|^2): -2 C' (x_j - x), and 4 C'' (x_j - x) (x_j - x) + 2 C' I.
+            // Derivatives of C(|x - x_j|^2) with respect to the receiver's place x: the first is -2 C' (x_j - x), the
+            // second is 4 C'' (x_j - x) (x_j - x) + 2 C' I.
             for (int axis = 0; axis < 3; ++axis) row(size_ + 1 + axis)[i] = -2 * first * place(i, axis) * present(i);
             for (int q = 0; q < 6; ++q) {
                 const V twice = 4 * second * place(i, FIRST[q]) * place(i, SECOND[q]);
@@ -199,8 +201,8 @@ class Equations {
         }
     }
 
-    // Cholesky factor L of the matrix L L^T in place, and L^-1 b in place of the right-hand sides b. A few rows at a
-    // time are reduced by the rows above, in tiles whose entries stay in registers.
+    // Replace the matrix L L^T by its Cholesky factor L, and the right-hand sides b by L^-1 b. A few rows at a time are
+    // reduced by the rows above, in tiles whose entries stay in registers.
     void factorise() {
         const Int all_rows = size_ + SIDES;
         for (Int begin = 0; begin < all_rows; begin += TALL) {
@@ -233,7 +235,7 @@ class Equations {
             for (int c = 0; c < WIDE; ++c) some[r][first + c] = sum[r][c];
     }
 
-    // One column of the rows from `begin` on; one of them may end there, on its diagonal.
+    // Reduce column j of the rows from `begin` on. One of these rows may end in this column, on the diagonal.
     void column(V* const* some, int count, Int begin, Int j) {
         const V* given = row(j);
         V sum[TALL];
@@ -250,11 +252,11 @@ class Equations {
         return square;
     }
 
-    // Multiply the right-hand sides by L^-T, a few columns at a time from the last on.
+    // Multiply the right-hand sides by L^-T, a few columns at a time, the last columns first.
     void substitute_back() {
         Int end = size_;
         for (Int begin = (size_ - 1) / WIDE * WIDE; begin >= 0; end = begin, begin -= WIDE) {
-            const bool whole = end - begin == WIDE;  // all but the first to be solved
+            const bool whole = end - begin == WIDE;  // in every step but the first
             for (int f = 0; f < SIDES; ++f) {
                 V* solution = row(size_ + f);
                 for (Int k = end - 1; k >= begin; --k) {
@@ -273,7 +275,7 @@ class Equations {
         }
     }
 
-    // Subtract the solved columns from `begin` on from the columns before.
+    // Subtract the share of the solved columns, which begin at `begin`, from the columns before them.
     template <int COUNT>
     void take_off(int f, Int begin) {
         V* solution[COUNT];
@@ -324,7 +326,7 @@ class Equations {
     eddies::Aligned<Real> places_, noise_, present_, rows_, inverse_;
 };
 
-// NaN for a receiver with too many neighbours.
+// Set the weights of a receiver with too many neighbours to NaN.
 template <typename Real>
 void leave_open(const Kriging& k, Int receiver) {
     constexpr Real none = std::numeric_limits<Real>::quiet_NaN();
@@ -401,7 +403,7 @@ void sum_weighted(const WeightedSums& t) {
         }
 }
 
-// Rows: all ten; field and gradient; gradient; or one.
+// The rows are all ten, those of the field and its gradient, those of the gradient, or one.
 template <typename Real>
 void sum_weighted(const WeightedSums& t) {
     if (t.rows == FUNCTIONALS) sum_weighted<Real, FUNCTIONALS>(t);

@@ -1,13 +1,13 @@
-// Passes over the Fourier modes of a vector field, for conjugate gradients on solenoidal ones: each reads and writes
-// the memory once; kernels/modes.py documents them. Sums are made in double precision plane by plane,
-// and these summed in order, so that nothing depends on the number of threads.
+// Loops over the Fourier modes of a vector field, for conjugate gradients on solenoidal modes. Each reads and writes
+// the memory once. kernels/modes.py documents them. Sums are in double precision: first over each plane, then over the
+// planes in order. So no result depends on the number of threads.
 
 #include <cstdint>
 #include <vector>
 
 namespace {
 
-// Real weights of modes: of each (z, y, x), and along the axes; kernels/modes.py has the same structure.
+// Real weights of the modes, for each mode (z, y, x) or along an axis. kernels/modes.py has the same structure.
 template <typename Real>
 struct Weights {
     std::int64_t z, y, x;
@@ -18,7 +18,7 @@ struct Weights {
     const Real* penalty;
 };
 
-// Sum of function(z, y, start of the line in an array of weights) over all lines.
+// Sum of function(z, y, start) over all lines along x; `start` is the index of a line's first number in the weights.
 template <typename Real, typename Function>
 double sum_over_lines(const Weights<Real>& weights, const Function& function) {
     std::vector<double> sums(weights.z);
@@ -30,8 +30,8 @@ double sum_over_lines(const Weights<Real>& weights, const Function& function) {
     return sum;
 }
 
-// image = P (scale given) + penalty modes, P the projection on solenoidal fields; the local sum of modes times image.
-// Vectors are (3, z, y, x) of complex numbers.
+// Set image = P (scale given) + penalty modes, where P projects on solenoidal fields. Returns this rank's sum of modes
+// times image. Vectors are (3, z, y, x) of complex numbers.
 template <typename Real>
 double image_of(const Weights<Real>& w, const Real* given, const Real* modes, Real* image) {
     const std::int64_t size = 2 * w.z * w.y * w.x;
@@ -63,7 +63,8 @@ double image_of(const Weights<Real>& w, const Real* given, const Real* modes, Re
     });
 }
 
-// solution += length direction, residual -= length image; the local sum of inverse times the residual squared.
+// solution += length direction, residual -= length image. Returns this rank's sum of inverse times the new residual
+// squared.
 template <typename Real>
 double descend(const Weights<Real>& w, Real length, const Real* inverse, const Real* direction, const Real* image,
                Real* solution, Real* residual) {

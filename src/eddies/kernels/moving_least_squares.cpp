@@ -9,11 +9,11 @@
 
 extern "C" {
 
-// Receivers and the particles listed near them in compressed rows, some of which may be beyond the kernel's support;
-// kernels/reconstruction.py has the same structure.
+// Receivers, and in compressed rows the particles near each receiver. Some of these particles may be beyond the
+// kernel's support. kernels/reconstruction.py has the same structure.
 struct Fit {
     std::int64_t receivers, periodic_z;
-    double length, volume, ridge;     // edge of the box; mean volume of a particle; see the definition
+    double length, volume, ridge;     // edge of the box; mean volume of a particle; see the equation
     const std::int64_t *offsets, *senders;
     const double *receiver, *position, *value, *kernel;  // (receivers, 3), (s, 3), (s, 3); kernel: see smoothing.hpp
     double *result;                   // (receivers, 4, 3): value, and its derivatives by x, y and z
@@ -27,7 +27,7 @@ using Int = std::int64_t;
 using V = eddies::Vector<double>;
 constexpr int lanes = eddies::VectorOf<double>::lanes;
 
-// 1, x, y, z and, of the second degree, xx, xy, xz, yy, yz, zz.
+// The monomials 1, x, y, z and, for the second degree, xx, xy, xz, yy, yz, zz.
 template <int SIZE>
 void monomials(const V* x, V* terms) {
     terms[0] = V{} + 1;
@@ -43,7 +43,7 @@ double sum_of_lanes(V numbers) {
     return sum;
 }
 
-// The normal equations of one receiver, neighbours a vector at a time, and their solution.
+// The normal equations of one receiver, and their solution. The sums take a vector of neighbours at a time.
 template <int SIZE>
 class Normal {
    public:
@@ -94,7 +94,7 @@ class Normal {
         }
     }
 
-    // Displacements and values of a vector of neighbours. Lanes without a neighbour get a distance beyond the support.
+    // Read displacements and values of a vector of neighbours. A lane without one gets a distance beyond the support.
     void read(Int receiver, Int pair, Int count, V* x, V* value) const {
         for (int lane = 0; lane < lanes; ++lane) {
             const Int sender = f_.senders[lane < count ? pair + lane : pair];
@@ -107,7 +107,8 @@ class Normal {
         }
     }
 
-    // Cholesky factor in place. It exists if a weight is not zero and there is a ridge; returns whether it does.
+    // Replace the matrix by its Cholesky factor. Returns whether the factor exists. It does if a weight is not zero and
+    // there is a ridge.
     bool factorise() {
         for (int j = 0; j < SIZE; ++j) {
             for (int k = 0; k < j; ++k) matrix_[j][j] -= matrix_[j][k] * matrix_[j][k];

@@ -6,19 +6,19 @@
 
 extern "C" {
 
-// Points that receive and that send, (number, 3) each; kernels/neighbors.py has the same structures.
+// Receivers and senders, which are points (number, 3); kernels/neighbors.py has the same structures.
 struct Search {
     std::int64_t receivers, senders;
     const double *receiver, *sender;
     double length;
     std::int64_t periodic_z;
     double radius;
-    std::int64_t exclude_self;  // whether receiver i is sender i, and not its own neighbour
-    std::int64_t* offsets;      // (receivers + 1), where the senders of each begin
+    std::int64_t exclude_self;  // whether receiver i is sender i, which is not its own neighbour
+    std::int64_t* offsets;      // (receivers + 1), where the senders of each receiver begin
 };
 
-// The pairs of a list that are within a radius now, for the receivers `rows` (count). Outputs are given in the second
-// of two calls.
+// The pairs of a list that are within a radius now, for the receivers with the indices `rows` (count). The first of two
+// calls fills `first`. Only the second one uses the members after it.
 struct Listed {
     std::int64_t count;
     const std::int64_t *rows, *offsets, *listed;
@@ -41,7 +41,7 @@ constexpr std::int64_t RECEIVERS = 512;  // in a task of a thread
 
 using List = std::vector<std::vector<std::int32_t>>;
 
-// Numbers of the senders of consecutive receivers.
+// Append the indices of the senders near the receivers begin ... end - 1, and store how many each of them has.
 void find(const Search& search, const Cells<double>& cells, std::int64_t begin, std::int64_t end,
           std::vector<std::int32_t>& senders) {
     const double limit = search.radius * search.radius;
@@ -123,7 +123,7 @@ void fill(const Listed& list) {
 
 extern "C" {
 
-// Makes `offsets` and keeps the list until `neighbors_take`. All positions are finite.
+// Fills `offsets` and keeps the list until `neighbors_take`. All positions are finite.
 void* neighbors_find(const Search* given) {
     const Search& search = *given;
     Cells<double> cells;
@@ -145,7 +145,7 @@ void neighbors_take(void* kept, std::int64_t* senders) {
     for (const auto& part : *list) senders = std::copy(part.begin(), part.end(), senders);
 }
 
-// Makes `first` of listed pairs.
+// Counts the listed pairs that are within the radius, and fills `first`.
 void neighbors_count(const Listed* given) {
     const Listed& list = *given;
     list.first[0] = 0;

@@ -12,7 +12,7 @@
 
 namespace eddies {
 
-// A power series in `x`, its first coefficient first.
+// A power series in `x`, the constant coefficient first.
 template <typename V, typename Real, std::size_t terms>
 inline V series(const Real (&coefficients)[terms], V x) {
     V sum = V{} + coefficients[terms - 1];
@@ -21,16 +21,16 @@ inline V series(const Real (&coefficients)[terms], V x) {
     return sum;
 }
 
-// Factor of the arguments of a tanh layer before `tanh_of`.
+// Factor by which the arguments of tanh are multiplied before `tanh_of`.
 template <typename Real>
 constexpr double TANH_UNIT = 1.0;
 
 // Vectors that `tanh_of` processes together, so that one does not wait for the result of each step.
 constexpr int TOGETHER = 4;
 
-// tanh(x) of y = x TANH_UNIT as y P(y^2) / Q(y^2), a minimax fit up to x = 8, and beyond as there; to 4e-7, and 6e-7
-// with round-off. In that unit the highest powers of both have the factor 1, which saves a product each. Two vectors
-// share a division, and so NaN in a lane of one becomes NaN in the other.
+// tanh(x) as y P(y^2) / Q(y^2) with y = x TANH_UNIT. This is a minimax fit for |x| <= 8; beyond, the value at 8 is
+// taken. Its error is 4e-7, or 6e-7 with round-off. In the unit TANH_UNIT the highest coefficients of P and Q are 1,
+// which saves two products. Two vectors share a division, and so NaN in a lane of one becomes NaN in the other.
 template <>
 constexpr double TANH_UNIT<float> = 0.021518350198783773;
 
@@ -59,7 +59,7 @@ inline void tanh_of(float* numbers) {
 // 1 - 2 / (exp(2 x) + 1); exp(a) = 2^n exp(r), a = n log 2 + r, by the series of exp(r).
 inline Vector<double> tanh_of(Vector<double> x) {
     using V = Vector<double>;
-    constexpr double round = 6755399441055744.0;  // next to which numbers are whole
+    constexpr double round = 6755399441055744.0;  // adding it rounds to an integer
     constexpr double inverse_factorial[] = {1.0, 1.0, 1.0 / 2, 1.0 / 6, 1.0 / 24, 1.0 / 120, 1.0 / 720, 1.0 / 5040,
                                             1.0 / 40320, 1.0 / 362880, 1.0 / 3628800, 1.0 / 39916800,
                                             1.0 / 479001600, 1.0 / 6227020800};
@@ -77,8 +77,8 @@ inline void tanh_of(double* numbers) {
     }
 }
 
-// A layer takes a tile of points at a time, so that what it reads stays in the first-level cache, and a group of rows
-// of its weights, so that their sums stay in registers.
+// A layer processes a tile of points at a time, so that what it reads stays in the first-level cache. It takes a group
+// of rows of its weights at a time, so that the sums stay in registers.
 #if defined(__AVX512F__)
 constexpr int TILE_VECTORS = 4, MOST_ROWS = 6;
 #elif defined(__AVX2__)
@@ -90,7 +90,7 @@ constexpr int TILE_VECTORS = 1, MOST_ROWS = 4;
 template <typename Real>
 constexpr int TILE = TILE_VECTORS * VectorOf<Real>::lanes;
 
-// Call `use` with a size as a constant of the compiler.
+// Call `use` with a size that the compiler knows.
 template <int most, typename Use>
 inline void with_size(int size, const Use& use) {
     if constexpr (most > 1)
@@ -98,7 +98,8 @@ inline void with_size(int size, const Use& use) {
     use(std::integral_constant<int, most>());
 }
 
-// Call `use` with the size and the first member of about equally large groups of at most `most` members.
+// Divide `count` members into about equally large groups of at most `most` members. Call `use` with the size and the
+// first member of each group.
 template <int most, typename Use>
 inline void in_groups(int count, const Use& use) {
     int first = 0;
@@ -118,7 +119,7 @@ struct TileRows {
     operator TileRows<const Real>() const { return {first, apart}; }
 };
 
-// A matrix (outputs, inputs): of each group of rows the first column, then the second.
+// A matrix (outputs, inputs), stored by groups of rows: of each group the first column, then the second, and so on.
 template <typename Real>
 class Matrix {
    public:
@@ -167,8 +168,8 @@ class Matrix {
     }
 };
 
-// The network; its parameters, as given and as gradients, are the weights (outputs, inputs) and biases (outputs) of one
-// layer after the other.
+// The network. Its parameters, and the gradients with respect to them, are in order of the layers: of each layer the
+// weights (outputs, inputs), then the biases (outputs).
 template <typename Real>
 class Network {
    public:
@@ -191,7 +192,7 @@ class Network {
         }
     }
 
-    // Memory of the features of the points, and of the gradient by them.
+    // Memory of the features of the points, and of the gradient with respect to them.
     Rows<Real>& features() { return values_.front(); }
     const Rows<Real>& by_features() const { return deltas_.front(); }
     // The same for the outputs.
@@ -209,7 +210,8 @@ class Network {
             }
     }
 
-    // After `forward`: gradients by parameters (added, a vector for each) and by features, from those by outputs.
+    // After `forward`: from the gradients with respect to the outputs, add those with respect to the parameters, a
+    // vector for each parameter, and find those with respect to the features if `features_too`.
     void backward(Real* by_parameters, bool features_too) {
         constexpr int lanes = VectorOf<Real>::lanes;
         for (int layer = 0; layer < layers(); ++layer)
@@ -233,14 +235,14 @@ class Network {
     std::vector<int> widths_;
     std::vector<Matrix<Real>> forth_, back_;  // back: (inputs, outputs)
     std::vector<std::vector<Real>> biases_;
-    std::vector<Rows<Real>> values_, deltas_;  // of hidden layers tile by tile
+    std::vector<Rows<Real>> values_, deltas_;  // those of hidden layers are tile by tile
 
     int layers() const { return static_cast<int>(widths_.size()) - 1; }
 
     // Number of rows of a tile, rounded up for tanh; rows beyond the width stay zero.
     static int held(int width) { return (width + TOGETHER - 1) / TOGETHER * TOGETHER; }
 
-    // Distances between rows and between tiles.
+    // Rows of a block; `apart` is the distance between rows, `next` that between tiles.
     struct BlockRows {
         const Real* first;
         std::ptrdiff_t apart, next;
@@ -258,7 +260,7 @@ class Network {
         return {rows[layer][0] + p * held(widths_[layer]), TILE<Real>};
     }
 
-    // Add the contribution of a block to the gradient by weights and biases of a layer.
+    // Add the contribution of a block to the gradient with respect to the weights and biases of a layer.
     void add_by_parameters(int layer, Real* by_parameters) {
         constexpr int lanes = VectorOf<Real>::lanes;
         const int inputs = widths_[layer], outputs = widths_[layer + 1];
@@ -278,7 +280,7 @@ class Network {
         }
     }
 
-    // Of some outputs and some inputs; weights of the next output are `inputs` further.
+    // The same for the weights of some outputs and some inputs. The weights of the next output are `inputs` further on.
     template <int rows, int columns>
     static void add_products(BlockRows deltas, BlockRows given, int inputs, Real* by_weights) {
         using V = Vector<Real>;

@@ -2,8 +2,9 @@
 //
 // Each evaluation sorts the particles by place, searches the pairs and processes them in blocks of BLOCK, so that
 // nothing is stored for a pair. A pair is found once, from the first of its two rows of cells, and contributes to both
-// particles. Rows of one colour have no target in common and are shared by threads. Every particle gets its
-// contributions in the same order for any number of threads.
+// particles. The targets of a row are the rows to whose particles it contributes. Two rows of one colour have no target
+// in common, so threads can process them at the same time. Every particle gets its contributions in the same order for
+// any number of threads.
 
 #include "cells.hpp"
 #include "summands.hpp"
@@ -33,7 +34,7 @@ namespace {
 
 using namespace eddies;
 
-constexpr int ROWS_TOGETHER = 4;  // of a colour, for one thread
+constexpr int ROWS_TOGETHER = 4;  // rows of a colour that a thread takes at a time
 
 // Results of calls. Any other result is the number of the first particle whose position is not finite.
 constexpr std::int64_t DONE = -1, UNKNOWN = -2, NO_GRADIENT = -3;
@@ -84,7 +85,7 @@ struct Sorted {
     int width;  // of a record
     Aligned<Real> records;
     Bits wanted;
-    std::vector<std::vector<std::int64_t>> colours;  // rows of each
+    std::vector<std::vector<std::int64_t>> colours;  // rows of each colour
 
     explicit Sorted(const Particles& given)
         : given(given), width(padded<Real>(6 + static_cast<int>(given.scalars))), records(given.count * width),
@@ -112,9 +113,9 @@ struct Sorted {
     }
 
    private:
-    // Each row gets the first colour without a row that shares a target.
+    // Give each row the first colour in which no other row has a target in common with it.
     void colour_rows() {
-        std::vector<std::vector<std::int64_t>> sources(cells.rows());  // colours that have each row as a target
+        std::vector<std::vector<std::int64_t>> sources(cells.rows());  // colours of the rows with each target
         std::vector<NearRow> near;
         for (std::int64_t row = 0; row < cells.rows(); ++row) {
             cells.near(row, near);
@@ -140,7 +141,8 @@ struct Queue {
     int count = 0;
     std::int32_t first[BLOCK + 2 * CANDIDATES], second[BLOCK + 2 * CANDIDATES];
 
-    // Add pairs of a particle with those of consecutive others whose bit is set, in this order or reversed.
+    // Add the pairs of particle i with those particles from `begin` on whose bit is set in `others`. If `turned`,
+    // particle i is the second one of each pair.
     void add(std::int64_t i, std::int64_t begin, std::uint64_t others, bool turned) {
         if (!others) return;
         const int number = __builtin_popcountll(others);
@@ -161,10 +163,11 @@ template <typename Real>
 class Worker {
    public:
     std::vector<std::unique_ptr<Summand<Real>>> summands;
-    std::vector<Aligned<Real>> by_parameters;  // a vector for each
+    std::vector<Aligned<Real>> by_parameters;  // for each summand, a vector for each parameter
 
-    // Adds to `results` (count, width) of the sorted particles: the sums or, if their gradients `by_sums` (count, width
-    // of sums) are given, the gradients by position, velocity and scalars, unless null.
+    // The worker adds to `results` (count, width), the records of the sorted particles. If `by_sums` is null, these are
+    // the sums. Otherwise `by_sums` (count, width of sums) are the gradients with respect to the sums, and `results`
+    // are the gradients with respect to position, velocity and scalars, or null.
     Worker(const Sorted<Real>& sorted, std::int64_t number, const Given* given, Real* results, const Real* by_sums)
         : given_(given), sorted_(sorted), cells_(sorted.cells), results_(results), by_sums_(by_sums),
           by_pairs_(sorted.width), first_(sorted.width), second_(sorted.width),
@@ -223,7 +226,7 @@ class Worker {
     int width_;                  // of the record of a particle's sums
     Rows<Real> sums_, others_;
 
-    // Search neighbours of a particle in a range.
+    // Search the neighbours of particle i in a range.
     void look(std::int64_t i, std::int64_t first, std::int64_t last) {
         const auto limit = static_cast<Real>(radius_ * radius_);
         const bool wanted = sorted_.wanted[i];
@@ -272,7 +275,7 @@ class Worker {
         scatter_add(sums_[0], width_, second, count, results_);
     }
 
-    // Components of all summands, as rows.
+    // Evaluate the components of all summands, as rows.
     void evaluate(const Block<Real>& pairs) {
         int column = 0;
         for (auto& summand : summands) {
@@ -281,7 +284,7 @@ class Worker {
         }
     }
 
-    // Contributions of mutual summands to the second particles.
+    // Replace the contributions of mutual summands to the first particles by those to the second ones.
     void turn_sums() {
         int column = 0;
         for (std::size_t s = 0; s < summands.size(); ++s)
@@ -292,7 +295,7 @@ class Worker {
             }
     }
 
-    // Quantities of pairs.
+    // Compute the quantities of pairs.
     void make_pairs(const std::int32_t* first, const std::int32_t* second) {
         using V = Vector<Real>;
         gather(sorted_.records.data(), sorted_.width, first, first_[0]);
@@ -339,7 +342,7 @@ class Worker {
         return swapped_;
     }
 
-    // Gradients of the contributions of a block to its first particles, and to the second ones if `mutual`.
+    // Add the gradients of the contributions of a block to its first particles, and to the second ones if `mutual`.
     void take_back(const Block<Real>& pairs, const std::int32_t* first, const std::int32_t* second, int count,
                    bool mutual) {
         gather(by_sums_, width_, first, sums_[0]);
@@ -384,7 +387,8 @@ class Worker {
     }
 };
 
-// Let workers process all pairs; `results` as in Worker. Gradients by parameters are summed over tasks in order.
+// Let workers process all pairs; `results` is as in Worker. Gradients with respect to parameters are summed over the
+// tasks in order.
 template <typename Real>
 void take_all(const Sorted<Real>& sorted, std::int64_t number, const Given* given, Real* results, const Real* by_sums) {
     struct Task {
@@ -433,7 +437,8 @@ void take_all(const Sorted<Real>& sorted, std::int64_t number, const Given* give
         }
 }
 
-// Columns (components, count) of all summands in the caller's order against records (count, width) in order of place.
+// Call move(summand, index in the caller's array (components, count), particle, column) for all components and
+// particles. The last two are the place of the number in the records (count, width) of the sorted particles.
 template <typename Real, typename Move>
 void each_column(const Sorted<Real>& sorted, std::int64_t number, const Given* given, const Move& move) {
     std::int64_t column = 0;
@@ -488,13 +493,13 @@ std::int64_t gradients(const Particles& particles, std::int64_t number, const Gi
 
 extern "C" {
 
-// The name of a kind of summand, in the order of their names; null beyond the last.
+// The name of the kind of summand with this number, in alphabetical order; null beyond the last.
 const char* pair_summand(std::int64_t number) {
     if (number >= std::int64_t(kinds().size())) return nullptr;
     return std::next(kinds().begin(), number)->first.c_str();
 }
 
-// Sums of all summands; returns DONE or an error, and then no sums.
+// Compute the sums of all summands. Returns DONE, or an error; the sums are then not computed.
 
 std::int64_t pair_sums_float32(const Particles* particles, std::int64_t number, const Given* given) {
     return sums<float>(*particles, number, given);
@@ -504,8 +509,8 @@ std::int64_t pair_sums_float64(const Particles* particles, std::int64_t number, 
     return sums<double>(*particles, number, given);
 }
 
-// Gradients by parameters and, unless `by` holds null pointers, by the columns of the particles, from those by sums,
-// which are zero at particles that are not wanted.
+// Compute the gradients with respect to the parameters and, unless `by` holds null pointers, with respect to the
+// columns of the particles. The given gradients with respect to the sums are zero at particles that are not wanted.
 
 std::int64_t pair_gradients_float32(const Particles* particles, std::int64_t number, const Given* given,
                                     const Gradients* by) {

@@ -25,8 +25,8 @@ namespace {
 
 using eddies::Vector;
 
-// Sums of a plane while particles are added: for each line four rows, one for each column. Rows extend beyond the box
-// by the reach of a particle at its end.
+// The sums of a plane while particles are added. A line of points has four rows, one for each column. Rows extend
+// beyond the box by the reach of a particle at the end of the box.
 template <typename Real>
 class Plane {
    public:
@@ -35,7 +35,7 @@ class Plane {
 
     Real* row(std::int64_t line, int column) { return rows_.data() + (4 * line + column) * width_; }
 
-    // (line, point, column); sums beyond the box are wrapped to its beginning.
+    // Write the sums as (line, point, column). Those beyond the box are added at its beginning.
     void write(Real* sums) {
         std::fill_n(sums, 4 * cells_ * cells_, Real(0));
         for (std::int64_t line = 0; line < cells_; ++line)
@@ -58,7 +58,7 @@ std::int64_t point_from(double coordinate, double spacing) {
 
 std::int64_t wrapped(std::int64_t point, std::int64_t cells) { return (point % cells + cells) % cells; }
 
-// Planes are shared by threads; each adds up its particles in their order, a vector of points along x at a time.
+// Threads share the planes. A plane gets its particles in their order, each for a vector of points along x at a time.
 template <typename Real>
 void add_up(const Reconstruction& r) {
     constexpr int lanes = eddies::VectorOf<Real>::lanes;

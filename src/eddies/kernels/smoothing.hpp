@@ -1,4 +1,4 @@
-// Smoothing kernels W(r) of compact support, as polynomials in each of equally long pieces of 0 <= r < h.
+// Smoothing kernels W(r) of compact support, given by a polynomial in each of equally long pieces of 0 <= r < h.
 
 #pragma once
 
@@ -14,8 +14,8 @@ class Smoothing {
     using V = Vector<Real>;
 
    public:
-    // h, the least value of W, the number of pieces, the number of coefficients; then the coefficients of each piece,
-    // in powers of u, which falls from 1 to 0 along the piece.
+    // `given` holds h, the least value of W, the number of pieces and the number of coefficients of a piece. Then come
+    // the coefficients of each piece. They belong to the powers of u, which falls from 1 to 0 along the piece.
     explicit Smoothing(const double* given)
         : pieces_(static_cast<int>(given[2])), width_(static_cast<int>(given[3])), stride_(padded<Real>(width_)),
           least_(static_cast<Real>(given[1])), per_length_(static_cast<Real>(given[2] / given[0])),

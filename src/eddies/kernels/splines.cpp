@@ -35,8 +35,9 @@ constexpr int PADDING = 8;         // numbers after the fractions along an axis 
 constexpr int FEW = 2000;          // points below which one thread is used
 constexpr double FARTHEST = 1e15;  // in cells; beyond, floating-point numbers do not resolve a cell
 
-// Bins are chunks of lines, cut into layers of planes, cut into strips of columns, all about equally large. There is
-// one chunk or an even number, and chunks are so long that the splines of every other one have no line in common.
+// The grid is cut into chunks of lines, each chunk into layers of planes, and each layer into strips of columns, which
+// are the bins. All bins are about equally large. There is one chunk or an even number of chunks. Chunks are so long
+// that the splines of two chunks have no line in common if another chunk is between them.
 struct Bins {
     std::int64_t chunks, layers, strips;
 
@@ -57,7 +58,7 @@ inline Vector loaded(const Real* place) {
     return vector;
 }
 
-// The components at one grid point and at the next ones, as many as fit a vector of 32 bytes.
+// `Point` holds the components at one grid point. `Wide`, of 32 bytes, holds those at one or two successive points.
 template <typename Real>
 struct Vectors;
 
@@ -91,7 +92,7 @@ inline void store(Real* place, const Vector& vector) {
     std::memcpy(place, &vector, sizeof(vector));
 }
 
-// The numbers of a, 0 to 3, and b, 4 to 7, at some places.
+// Numbers of the vectors a and b by their places: 0 to 3 are those of a, 4 to 7 those of b.
 #ifdef __clang__
 #define PICKED(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
 #else
@@ -145,7 +146,7 @@ struct Weights {
         }
     }
 
-    // Their derivatives with respect to the fraction: differences of the next lower degree.
+    // The derivatives with respect to the fraction, which are differences of splines of the next lower degree.
     static Weights slopes(const Wide& fraction) {
         const Weights<degree - 1, Real> lower(fraction);
         Weights result(fraction);
@@ -273,7 +274,7 @@ struct Tile {
     }
 
   private:
-    // function(the components' lines in memory, the line of the tile)
+    // Call function(the components' lines in memory, the line of the tile) for all lines of the tile.
     template <typename Pointer, typename Function>
     void over_lines(Pointer const* planes, int components, const Function& function) {
         for (int k = 0; k < size[2]; ++k)
@@ -286,7 +287,7 @@ struct Tile {
     }
 };
 
-// function(number of the first, how many) of the components, as many as a tile holds.
+// Call function(first component, number of components) for groups of components that fit a tile.
 template <typename Function>
 void by_components(std::int64_t components, const Function& function) {
     for (std::int64_t c = 0; c < components; c += TOGETHER)
@@ -426,7 +427,7 @@ void spread(const Cloud& cloud, std::int64_t components, Real* const* planes, co
     }
 }
 
-// Part of each of `size` places that are cut into about equal parts.
+// For each of `size` places, the number of the part in which it lies. All parts are about equally long.
 std::vector<std::int32_t> parts_of(std::int64_t size, std::int64_t parts) {
     std::vector<std::int32_t> part_of(size);
     for (std::int64_t part = 0; part < parts; ++part)

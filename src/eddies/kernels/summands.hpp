@@ -15,10 +15,11 @@
 
 extern "C" {
 
-// A summand, its sums and gradients; null where not requested. kernels/pairs.py has the same structure.
+// A summand, and arrays for its sums and gradients, which are null if not requested. kernels/pairs.py has the same
+// structure.
 struct Given {
     const char* kind;
-    std::int64_t numbers_count, parameters_count, components, scalar;  // the first scalar that it reads
+    std::int64_t numbers_count, parameters_count, components, scalar;  // `scalar`: the first one that it reads
     const double *numbers, *parameters;
     const double* parity;      // (components): factor of the value for the second particle of a mutual pair
     void* sums;                // (components, count)
@@ -32,16 +33,17 @@ namespace eddies {
 
 constexpr int MOST_SCALARS = 4;  // columns of numbers that particles carry
 
-// Pairs: separation in filter widths and velocity difference in units of the velocity, first minus second particle;
-// length of the separation, weight (1 - q^2)^2, and scalars of the first and the second particle.
+// A block of pairs: their separations x in filter widths and velocity differences v in units of the velocity, both of
+// the first minus the second particle; the length of x; the weight (1 - q^2)^2, where q is this length divided by the
+// radius; and the scalars of the first and the second particles.
 template <typename Real>
 struct Block {
     alignas(64) Real x[3][BLOCK], v[3][BLOCK], distance[BLOCK], weight[BLOCK];
     const Real* scalar[2][MOST_SCALARS];
 };
 
-// Gradients by these, initially zero. Those by separation, velocity difference and scalars are rows in the order of the
-// records of first and second particles.
+// Gradients with respect to the members of Block, zero at first. Those with respect to separation, velocity difference
+// and scalars are rows in the order of the records of first and second particles.
 template <typename Real>
 struct ByPairs {
     int width;
@@ -79,17 +81,17 @@ template <typename Real>
 class Summand {
    public:
     const int components;
-    int scalars = 0, parameters = 0;  // that it reads
+    int scalars = 0, parameters = 0;  // how many of each it reads
     bool differentiable = true;
 
     explicit Summand(int components) : components(components) {}
     virtual ~Summand() = default;
 
-    // Components of pairs.
+    // Compute the components of pairs.
     virtual void values(const Block<Real>& pairs, Components<Real> result) = 0;
 
-    // From the gradient by components: add to the gradient by the quantities of the pairs, unless it is null, and to
-    // the gradient by parameters, a vector for each.
+    // From the gradients with respect to the components, add to those with respect to the quantities of the pairs,
+    // unless these are null, and to those with respect to the parameters, a vector for each parameter.
     virtual void gradients(const Block<Real>&, GivenComponents<Real>, ByPairs<Real>*, Real*) {}
 };
 
@@ -221,14 +223,15 @@ inline Real dot(const Real (*a)[BLOCK], const Real (*b)[BLOCK], int p) {
 // Added to lengths by which vectors are divided (particles/terms/pair_network.py).
 constexpr double SMALL = 1e-6;
 
-// w NN_1 x and w NN_2 v, or with one output w NN, of a network of the pairs' invariants; with unit vectors x/|x| and
-// v/|v|; with w = 1 where pairs are not weighted; with one output times the sign of the difference of densities.
+// w NN_1 x and w NN_2 v or, with one output, w NN, where NN is a network of the pairs' invariants. Options: unit
+// vectors x/|x| and v/|v| take the place of x and v; w is 1, because pairs are not weighted; a single output is
+// multiplied by the sign of the difference of densities.
 template <typename Real>
 class PairNetwork : public Summand<Real> {
    public:
-    // Numbers: outputs, whether densities enter as sum and square of the difference, whether the network reads
-    // density (the scalar), distance, speed, approach; whether directions are unit vectors, pairs weighted, the output
-    // times the sign; widths of hidden layers.
+    // Numbers: the number of outputs; whether densities enter as their sum and the square of their difference; whether
+    // the network reads density (the scalar), distance, speed, approach; whether directions are unit vectors; whether
+    // pairs are weighted; whether the output is multiplied by the sign; and the widths of the hidden layers.
     explicit PairNetwork(const Given& given)
         : Summand<Real>(given.numbers[0] == 2 ? 6 : 1), symmetric_(given.numbers[1]),
           scalar_(static_cast<int>(given.scalar)), density_(given.numbers[2]), distance_(given.numbers[3]),
@@ -275,8 +278,7 @@ class PairNetwork : public Summand<Real> {
     int scalar_;
     bool density_, distance_, speed_, approach_, unit_, weighted_, sign_;
     Network<Real> network_;
-    // |v|; the factors of x and v: 1, or 1/|x| and 1/|v|, the sign being one of x; w, where it is not that of the
-    // pairs.
+    // |v|; the factors of x and v, which are 1, or 1/|x| and 1/|v|, or the sign for x; w if pairs are not weighted.
     alignas(64) Real speed_of_[BLOCK], by_x_[BLOCK], by_v_[BLOCK], open_[BLOCK];
     const Real* window_;  // w
 
@@ -368,7 +370,7 @@ class PairNetwork : public Summand<Real> {
         }
     }
 
-    // Gradient of w NN_1 b_1 and w NN_2 b_2 by w and the directions at fixed NN_1 and NN_2.
+    // Add the gradient of w NN_1 b_1 and w NN_2 b_2 with respect to w and to the directions b, at fixed NN_1 and NN_2.
     void add_by_directions(const Block<Real>& pairs, GivenComponents<Real> given, const Real* along_x,
                            const Real* along_v, ByPairs<Real>& by) {
         for (int c = 0; c < 3; ++c) EDDIES_PAIRS {
@@ -412,7 +414,7 @@ struct Moments {
 
 static const bool moments = declare_formula<Moments>("moments");
 
-// w, or 1 for pairs within the radius.
+// w or, if pairs are not weighted, 1 for pairs within the radius.
 template <typename W>
 inline auto window(const W& w, bool weighted) {
     using Real = std::decay_t<decltype(value_of(w)[0])>;
@@ -438,9 +440,9 @@ inline auto tanh_if(bool bounded, const A& a) {
         return value;
 }
 
-// w Pi x/(unit |x| + length) with Pi = mu (|a_2| mu - |a_1|), mu = x.v / (|x|^2 + softening); for all pairs; for
-// approaching ones; or with tanh(x.v). Numbers: 0, 1 or 2 of these forms, the softening, whether pairs are weighted,
-// unit and length. Parameters: |a_1| and |a_2|.
+// w Pi x/(unit |x| + length) with Pi = mu (|a_2| mu - |a_1|), mu = x.v / (|x|^2 + softening). Form 0 is for all pairs;
+// in form 1 mu is 0 unless the particles approach; form 2 has tanh(x.v) in place of x.v. Numbers: the form, the
+// softening, whether pairs are weighted, unit and length. Parameters: |a_1| and |a_2|.
 template <typename Real>
 struct EddyViscosity {
     static constexpr int components = 3, scalars = 0, parameters = 2;

@@ -33,7 +33,7 @@ struct VectorOf {
 template <typename Real>
 using Vector = typename VectorOf<Real>::type;
 
-// Integers of the same size.
+// Integers of the same size as the numbers.
 template <typename Real>
 struct BitsOf;
 
@@ -84,7 +84,7 @@ inline const Vector<Real>& vector_at(const Real* place) {
     return *reinterpret_cast<const Vector<Real>*>(place);
 }
 
-// Numbers of at most that size: the nearest ones of others. NaN stays NaN.
+// The numbers, limited to the range -largest ... largest. NaN stays NaN.
 template <typename Real>
 inline Vector<Real> clipped(Vector<Real> x, Real largest) {
     const Vector<Real> above = Vector<Real>{} + largest, below = -above;
@@ -152,7 +152,7 @@ class Aligned {
     std::unique_ptr<Real, decltype(&std::free)> numbers_;
 };
 
-// Rows of a block.
+// Rows of BLOCK numbers, one for each point of a block.
 template <typename Real>
 class Rows {
    public:
@@ -174,7 +174,7 @@ constexpr int padded(int numbers) {
     return (numbers + GROUP<Real> - 1) / GROUP<Real> * GROUP<Real>;
 }
 
-// A vector of groups, one after the other, and back.
+// A vector that holds some groups, one after the other.
 template <typename Real>
 inline Vector<Real> together(const Real* const* groups) {
 #ifdef __AVX512F__
@@ -186,13 +186,14 @@ inline Vector<Real> together(const Real* const* groups) {
 #endif
 }
 
+// Add numbers to a group.
 template <typename Real>
 inline void add_to(Real* group, const Real* numbers) {
     typedef Real Group __attribute__((vector_size(32), may_alias, aligned(sizeof(Real))));
     *reinterpret_cast<Group*>(group) += *reinterpret_cast<const Group*>(numbers);
 }
 
-// Rows of groups against their columns: lane `stage` apart after lane changes places.
+// Transpose groups in GROUP rows: row r and lane l of a group change places. One call exchanges lanes `stage` apart.
 template <typename Real, int stage = 1>
 inline void transpose(Vector<Real>* rows) {
     constexpr int lanes = VectorOf<Real>::lanes;
