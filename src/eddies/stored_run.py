@@ -213,4 +213,5 @@ def at_time(found: Any, name: str, time: float | None) -> Any:
     around = np.diff(times).max() if len(times) > 1 else np.inf
     if time is not None and not times[0] - around <= time <= times[-1] + around:
         raise UserError(f"time = {time:g}: must be between {times[0]:g} and {times[-1]:g}, the stored times")
-    return found[name][-1 if time is None else int(np.argmin(np.abs(times - time)))]
+    # `time` may be an xarray number, which numpy does not subtract from an array.
+    return found[name][-1 if time is None else int(np.argmin(np.abs(times - float(time))))]

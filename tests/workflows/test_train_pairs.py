@@ -32,8 +32,8 @@ def test_training_evaluates_pairs_with_ghosts_and_sums_gradients(comm, tmp_path,
     evaluated, summed = [], []
 
     class Counted(CompiledPairs):
-        def __init__(self, library, space, position, velocity, scalars, wanted, kind):
-            super().__init__(library, space, position, velocity, scalars, wanted, kind)
+        def __init__(self, space, position, velocity, scalars, wanted, kind):
+            super().__init__(space, position, velocity, scalars, wanted, kind)
             self.given = space, position, wanted
 
         def gradients(self, summands, parameters, by_sums, columns):
