@@ -168,7 +168,7 @@ def test_energies_of_known_waves_by_bands(comm):
 
 @pytest.mark.mpi(2)
 def test_the_resolved_velocity_is_solenoidal_and_what_it_misses_is_the_rest(comm):
-    """Of particles with random velocities in seven octants of the box."""
+    """The particles have random velocities and fill seven octants of the box."""
     random = np.random.default_rng(8)
     position = random.uniform(0, LENGTH, (700, 3))
     position = position[(position > LENGTH / 2).any(1)]

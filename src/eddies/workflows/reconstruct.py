@@ -27,7 +27,6 @@ from eddies.particles.forms import Form
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.particle_set import ParticleSet, as_numpy
-from eddies.particles.remembered_velocity import RememberedVelocity
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import CubicSpline, SmoothingKernel
 from eddies.pipeline import STAGES
@@ -35,12 +34,12 @@ from eddies.scene.scene import BOX_LENGTH, Reconstruction, Scene, Tracers, Track
 from eddies.scene.sections import NEIGHBORS, RECONSTRUCTED
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.workflows.ground_truth.flow_run import restored_modes, saved_modes
-from eddies.workflows.ground_truth.track_frames import TrackFrames
+from eddies.workflows.ground_truth.track_frames import TrackFrames, count_for
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import load_form
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
-from eddies.workflows.track_solver import (HELD_OUT, NO_FILTER, LeastSquaresMethod, best_solver, particles_on,
-                                           slabs_for, solver_of, split, validation_error)
+from eddies.workflows.track_solver import (HELD_OUT, NO_FILTER, best_solver, particles_on, slabs_for, solver_of,
+                                           solving_method, split, validation_error)
 
 log = logging.getLogger("eddies")
 
@@ -98,7 +97,7 @@ class Source:
             self._tracks = source = TrackFrames(comm, tracks)
             self.times, self.spacing, self.most = source.times, source.spacing, source.most
             self.unit, self.corner = source.about["length_unit"], source.about["corner"]
-            tracers = tracers.with_count(source.even_count)
+            tracers = tracers.with_count(count_for(self.spacing))
         resolved = settings.resolving(tracers, filtered)
         width = width if filtered else NO_FILTER * self.spacing
         self.scales = read_attributes(file, "reference") | {"spacing": resolved.spacing, "filter_width": width}
@@ -273,10 +272,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
 def _maker(settings: Reconstruction, tracers: Tracers, viscosity: float, kernel: SmoothingKernel,
            solver: ResolvedVelocity, weight: float, transfer: Tensor) -> Callable[[], Method]:
     """Return a function that makes a new method of [reconstruction]. Only estimates from neighbours use the kernel."""
-    if settings.method == "least-squares":
-        return lambda: LeastSquaresMethod(solver)
-    if settings.method == "memory":
-        return lambda: RememberedVelocity(solver, viscosity, transfer, settings.memory, weight)
+    if not settings.of_neighbors:
+        return lambda: solving_method(settings, solver, viscosity, transfer, weight)
     form = Form(settings.method, kernel, tracers.filter_width, tracers.spacing**3)
     return lambda: NeighbourMethod(form, solver.grid)
 

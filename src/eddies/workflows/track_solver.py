@@ -17,8 +17,9 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.exchanges import mean_over_ranks, relative_error
 from eddies.particles.flow_units import ReferenceScales, resolved_wavenumber
 from eddies.particles.particle_set import ParticleSet
+from eddies.particles.remembered_velocity import RememberedVelocity
 from eddies.particles.resolved_velocity import WEIGHT, ResolvedVelocity
-from eddies.scene.scene import BOX_LENGTH, Tracers
+from eddies.scene.scene import BOX_LENGTH, Reconstruction, Tracers
 from eddies.scene.sections import CELLS_PER_WAVENUMBER
 
 WEIGHTS = 10.0 ** np.arange(3, -1.1, -0.5)  # weights of the noise in least squares; cross-validation chooses one
@@ -45,6 +46,17 @@ class LeastSquaresMethod:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self._near = state["modes"]
+
+
+def solving_method(settings: Reconstruction, solver: ResolvedVelocity, viscosity: float, transfer: Tensor,
+                   weight: float) -> LeastSquaresMethod | RememberedVelocity:
+    """Make the method "memory" or "least-squares" of [reconstruction].
+
+    `transfer` is the transfer function of the filter that the particles' velocity has passed.
+    """
+    if settings.method == "memory":
+        return RememberedVelocity(solver, viscosity, transfer, settings.memory, weight)
+    return LeastSquaresMethod(solver)
 
 
 def best_solver(particles: ParticleSet, make: Callable[[float], ResolvedVelocity],

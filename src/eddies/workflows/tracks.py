@@ -27,15 +27,14 @@ from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.flow_units import measured_scales
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.particle_set import ParticleSet, as_numpy
-from eddies.particles.remembered_velocity import RememberedVelocity
 from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Flow, Model, Scene, SceneError, Simulation, Tracers
 from eddies.scene.sections import Eulerian, Initial, Reconstruction, Tracks
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
-from eddies.workflows.ground_truth.track_frames import TrackFrames, read_measured
+from eddies.workflows.ground_truth.track_frames import TrackFrames, count_for, read_measured
 from eddies.workflows.run_directory.fingerprints import stage_provenance
-from eddies.workflows.track_solver import (NO_FILTER, LeastSquaresMethod, best_solver, particles_on, slabs_for,
-                                           solver_of)
+from eddies.workflows.track_solver import (NO_FILTER, best_solver, particles_on, slabs_for, solver_of,
+                                           solving_method)
 
 log = logging.getLogger("eddies")
 
@@ -108,7 +107,7 @@ def _sections_of(settings: Tracks, learned: bool) -> dict[str, Flow | Tracers]:
     if learned and present < LEAST_TRACKS:
         raise SceneError(f"{settings.file}: only {present} of {tracks.about['in_file']} tracks are in {where}, but a "
                          f"model needs {LEAST_TRACKS}; give another part of the file")
-    count = present if learned else max(round((BOX_LENGTH / tracks.spacing) ** 3), LEAST_TRACKS)
+    count = present if learned else max(count_for(tracks.spacing), LEAST_TRACKS)
     speed = float(np.sqrt(np.mean(tracks.columns["velocity"]**2)))
     turnover = INTEGRAL_SCALE * BOX_LENGTH / speed if speed > 0 else math.inf
     width = None if settings.filter_width is None else settings.filter_width / tracks.unit
@@ -135,7 +134,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     viscosity, follows = scene.flow.viscosity, tracers.filtered and not filtered
     complete, times, spacing = tracks.complete, tracks.times, tracks.spacing
     settings = Reconstruction(method="memory" if follows and viscosity > 0 else "least-squares")
-    own = tracers.with_count(tracks.even_count)
+    own = tracers.with_count(count_for(spacing))
     first, second = tracks.shared(0, 1), tracks.shared(1, 0)
     reference = {"filter_width": tracers.filter_width, "spacing": tracers.spacing, "density_mean": 1.0,
                  "viscosity": viscosity, **measured_scales(comm, first, second, times[1])}
@@ -162,8 +161,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         trajectory = (TrajectoryWriter(file, "tracers", count, BOX_LENGTH, shapes, np.float64)
                       if count >= LEAST_TRACKS else None)
         fields = FieldWriter(file, "filtered", coarse.cells, {"velocity": 3})
-        method = (LeastSquaresMethod(solver) if settings.method == "least-squares" else RememberedVelocity(
-            solver, viscosity, torch.ones_like(solver.grid.shell), settings.memory, weight))
+        # A memory is of an unfiltered flow: G = 1.
+        method = solving_method(settings, solver, viscosity, torch.ones_like(solver.grid.shell), weight)
         rows, spectra = [], []
         for frame, time in enumerate(times):
             if stop is not None:

@@ -174,3 +174,17 @@ def test_times_of_large_and_of_shortened_stages():
     assert 6 < seconds(load_scene("hit-paper"), "dns", 256) / 3600 < 50
     taken = one_model("hit-small", ["model.path=somewhere"])
     assert START["train"] < seconds(taken, "train", 1) < 0.5 * seconds(one_model("hit-small"), "train", 1)
+
+
+def test_a_memory_of_an_unfiltered_flow_has_eight_times_the_grid_points():
+    """Frames of 32^3 tracers on 56^3 grid points; with memory on 112^3 unless the tracers are filtered."""
+    def needs(method, filtered):
+        scene = load_scene("hit-small", [f"reconstruction.method={method}", f"tracers.filtered={filtered}"],
+                           ["kernel", "model", "training", "simulation", "variant"])
+        return seconds(scene, "reconstruct", 1), storage(scene, "reconstruct", 1).memory - TORCH_PROCESS
+
+    time, memory = needs("memory", "false")
+    assert needs("memory", "true") == needs("least-squares", "true")
+    assert needs("least-squares", "false") == needs("least-squares", "true")
+    # Beside the grid there are a start of about a second, and the particles.
+    assert 6 < time / needs("least-squares", "false")[0] <= 8 and 4 < memory / needs("least-squares", "false")[1] <= 8

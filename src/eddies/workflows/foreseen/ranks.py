@@ -12,7 +12,7 @@ from eddies.scene.sections import NEIGHBORS
 from eddies.workflows.foreseen.numbers import expected_turbulence
 
 PEAK_VELOCITY = 4.0          # largest component of the velocity of a particle, divided by u'
-ALLOWED_VELOCITY = 6.0       # the same, but for the number of ghost planes in the training through horizons
+ALLOWED_VELOCITY = 6.0       # largest such ratio that the training through horizons allows
 GHOST_PLANES = {"cubic": 3, "quintic": 4}
 RESOLVED = "ghost planes of the resolved velocity"
 

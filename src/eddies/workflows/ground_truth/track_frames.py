@@ -87,11 +87,6 @@ class TrackFrames:
                                           found.complete, found.spacing, int(np.diff(found.starts).max())))
         self._tracks = read_measured(settings) if comm.rank == 0 else None
 
-    @property
-    def even_count(self) -> int:
-        """Number of particles that would fill the periodic cube with the mean spacing of the tracks."""
-        return round((BOX_LENGTH / self.spacing) ** 3)
-
     def frame(self, number: int, complete: bool = False) -> dict[str, np.ndarray]:
         """Return this rank's block of the rows of a frame; see `MeasuredTracks.frame`."""
         return self._block(lambda tracks: tracks.frame(number, complete))
@@ -108,6 +103,11 @@ class TrackFrames:
             blocks = [{name: values[start:stop] for name, values in columns.items()}
                       for start, stop in zip(starts, starts[1:])]
         return dict(self.comm.scatter(blocks))
+
+
+def count_for(spacing: float) -> int:
+    """Return the number of particles with this mean spacing that fill the periodic cube."""
+    return round((BOX_LENGTH / spacing) ** 3)
 
 
 def read_measured(settings: Settings) -> MeasuredTracks:
