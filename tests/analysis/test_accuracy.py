@@ -11,6 +11,7 @@ from eddies.measures import MEASURES
 TURNOVER, TIMES = 1.2, np.linspace(0, 1.2, 7)
 LENGTH, RNG = 2 * np.pi, np.random.default_rng(4)
 VELOCITY, ACCELERATION, GRADIENT = (RNG.normal(size=(4000, *shape)) for shape in ((3,), (3,), (3, 3)))
+VELOCITY, ACCELERATION = (rows - rows.mean(axis=0) for rows in (VELOCITY, ACCELERATION))
 START = RNG.uniform(0, LENGTH, (4000, 3))
 SPECTRUM = np.exp(-np.arange(9.0))
 KL_FLOORS = {"velocity_kl_floor", "acceleration_kl_floor", "qr_kl_floor"}

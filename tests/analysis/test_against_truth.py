@@ -32,4 +32,4 @@ def test_only_particles_with_a_density_have_a_series_of_it():
     assert list(particle_series(run, [1])) == ["time", "energy"]
     run.columns.append("density")
     found = particle_series(run, [0, 1])
-    assert found["energy"].tolist() == [4.5, 18.0] and np.allclose(found["density_rms"], [0.1, 0.2])
+    assert found["energy"].tolist() == [1.5, 6.0] and np.allclose(found["density_rms"], [0.1, 0.2])

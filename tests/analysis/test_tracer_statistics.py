@@ -31,7 +31,7 @@ def spectra(energy):
 
 def test_known_tracers():
     tracers = Drifting()
-    found = tracer_statistics(tracers, spectra(0.5 * np.mean(np.sum(tracers.first**2, axis=1))), SPACING)
+    found = tracer_statistics(tracers, spectra(1.5 * np.mean(np.var(tracers.first, axis=0))), SPACING)
     assert found.energy_ratio[0] == pytest.approx(1.0)
     # At time 0.2 the variance of the velocities has grown by that of the acceleration times 0.2^2.
     assert found.energy_ratio[1] == pytest.approx(1.04, abs=0.02)

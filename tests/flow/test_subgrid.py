@@ -171,7 +171,8 @@ def test_learned_damping_is_that_of_the_particle_model(grid, velocity):
     velocity = np.where(grid.index_squared > grid.cutoff**2, 0, velocity)  # particles resolve a ball of modes
     rates = np.array([0.1, 0.3, 0.2, 0.5, 0.4, 0.9])
     force = force_of(EddyDamping(grid, rates), velocity)
-    flow = ResolvedFlow(FourierGrid(grid.decomposition, grid.cutoff), torch.from_numpy(velocity), None, None, 0.0)
+    flow = ResolvedFlow(FourierGrid(grid.decomposition, grid.cutoff), torch.zeros(3), torch.from_numpy(velocity), None,
+                        None, 0.0)
     term = Damping(Damping.Settings(), None)
     term.load_state_dict({"rates": torch.from_numpy(rates)})
     found = term(SimpleNamespace(resolved=flow, decomposition=grid.decomposition)).force_modes

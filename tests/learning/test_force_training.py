@@ -196,7 +196,8 @@ def test_a_model_without_networks_reaches_the_least_squares_fit(comm):
     """The loss is quadratic in the seven factors of the model."""
     trainer = trainer_of(comm, "resolved", LossWeights(), batch=10**6)
     assert not trainer.model.networks and trainer.frames[0].dynamics.neighborhood is None
-    losses = [row["loss"] for row in fitted(trainer, 300, (1e-1, 1e-2))]
+    # Nearly all of the velocity is resolved, so the factors that fit are large.
+    losses = [row["loss"] for row in fitted(trainer, 400, (1.0, 1e-2))]
     frame = trainer.frames[0]
     slopes = torch.cat([frame.kept[name].slopes["acceleration"] for name in frame.kept if frame.kept[name].slopes])
     slopes = slopes.flatten(1)

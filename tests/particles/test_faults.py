@@ -8,7 +8,8 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
 from tests.particles.configurations import LENGTH, state
 
-LIMITS, BOX = Limits(speed=20.0, density_mean=1.0, density_deviation=0.5), PeriodicBox(LENGTH)
+LIMITS = Limits(speed=20.0, frame=torch.zeros(3), density_mean=1.0, density_deviation=0.5)
+BOX = PeriodicBox(LENGTH)
 
 
 def sound(count=6):

@@ -107,14 +107,14 @@ def test_a_term_that_is_not_linear_is_named(comm):
 
 @pytest.mark.mpi(1, 2)
 def test_the_modes_of_a_force_are_those_of_its_acceleration(comm):
-    """Minus the mean over particles; also beside terms that read the density, and for some rows."""
+    """At the particles; also beside terms that read the density, and for some rows."""
     slab, particles = distributed(comm, *state())
     forces = model({word: settings for word, settings in MODELS["resolved"].items() if word != "relaxation"}).terms
     lagrangian = LagrangianModel(forces, FLOW)
     dynamics = dynamics_of(slab, lagrangian, iterations=5)
     context = dynamics.context(particles)
     rates = lagrangian.rates(context)
-    expected = context.without_mean(context.resolved.at_particles(rates.force_modes))
+    expected = context.resolved.at_particles(rates.force_modes)
     assert rates.acceleration.abs().max() > 0.1 and torch.allclose(rates.acceleration, expected, atol=1e-13)
     pairs = model(pairs={}).terms
     both = dynamics_of(slab, LagrangianModel({**pairs, **forces}, FLOW), iterations=5).rates(particles)

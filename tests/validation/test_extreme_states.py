@@ -29,7 +29,7 @@ def complaint_after(comm, model, step, count, integrator="rk4"):
     except HaloError as error:
         return str(error), None
     scales = model.flow.scales
-    limits = Limits(30 * scales.velocity, scales.density_mean, 300 * scales.density)
+    limits = Limits(30 * scales.velocity, torch.zeros(3), scales.density_mean, 300 * scales.density)
     fault = find_fault(end, limits, dynamics.box, step=1, rank=comm.rank)
     return first_complaint(comm, fault), by_id(comm, end, end.velocity, len(random_points()))
 

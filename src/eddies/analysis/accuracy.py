@@ -6,7 +6,7 @@ import numpy as np
 
 from eddies.analysis.against_truth import EDGES, last_invariants, pdf_divergence, sampling_floor
 from eddies.analysis.disorder import drifts
-from eddies.analysis.errors import normalized_l2
+from eddies.analysis.errors import fluctuations, normalized_l2, velocity_error
 from eddies.analysis.lagrangian import differences, of_both
 from eddies.analysis.rollout import Rollout
 from eddies.measures import MEASURES
@@ -17,10 +17,11 @@ def accuracy(run: Rollout) -> dict[str, float | None]:
 
     The end is the last time that model and truth have in common, in units of the turnover time T. A measure is None if
     its data are missing, for example because the rollout or the truth ends too early. Velocity errors are normalised L2
-    errors over all particles. Those at the Kolmogorov time t_eta and at T/2 are interpolated linearly between frames.
-    The acceleration error is that of the first common frame. The other measures are taken at the last common frame or,
-    if they are Lagrangian statistics, over all common frames. These are None for a rollout that stops early or has a
-    frame that is not finite, because such a rollout ends earlier than the others.
+    errors over all particles; they and the energy leave the mean velocity out. Those at the Kolmogorov time t_eta and
+    at T/2 are interpolated linearly between frames. The acceleration error is that of the first common frame. The other
+    measures are taken at the last common frame or, if they are Lagrangian statistics, over all common frames. These are
+    None for a rollout that stops early or has a frame that is not finite, because such a rollout ends earlier than the
+    others.
     """
     measures: dict[str, float | None] = dict.fromkeys(MEASURES)
     try:
@@ -43,15 +44,15 @@ def _velocity_error_at(run: Rollout, time: float) -> float | None:
         return None
     around = [index for index in (above - 1, above) if index >= 0]
     pairs = [run.pair(index, "velocity") for index in around]
-    return float(np.interp(time, times[around], [normalized_l2(pair.model, pair.truth) for pair in pairs]))
+    return float(np.interp(time, times[around], [velocity_error(pair.model, pair.truth) for pair in pairs]))
 
 
 def _at_the_end(run: Rollout) -> Mapping[str, float | None]:
     last = run.common.times.size - 1
     velocity, acceleration = (run.pair(last, name) for name in ("velocity", "acceleration"))
     measures: dict[str, float | None] = {
-        "velocity_error_end": normalized_l2(velocity.model, velocity.truth),
-        "energy_ratio": float(np.sum(velocity.model**2, dtype=float) / np.sum(velocity.truth**2, dtype=float)),
+        "velocity_error_end": velocity_error(velocity.model, velocity.truth),
+        "energy_ratio": float(np.sum(fluctuations(velocity.model) ** 2) / np.sum(fluctuations(velocity.truth) ** 2)),
         "velocity_kl": pdf_divergence(velocity, EDGES["velocity"]),
         "velocity_kl_floor": sampling_floor(velocity, EDGES["velocity"]),
         "acceleration_kl": pdf_divergence(acceleration, EDGES["acceleration"]),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from eddies.analysis.errors import normalized_l2
+from eddies.analysis.errors import fluctuations, velocity_error
 from eddies.analysis.pdfs import bin_edges, bin_probabilities, kl_divergence, sampling_divergence, standardized
 from eddies.analysis.rollout import Frames, Pair, Rollout
 from eddies.analysis.velocity_gradients import ConditionalVelocity, InvariantBins, Invariants
@@ -15,14 +15,14 @@ EDGES = {"velocity": bin_edges(5, 60), "acceleration": bin_edges(8, 80)}
 
 
 def mean_energy(frames: Frames, frame: int) -> float:
-    """Return the mean kinetic energy <v.v>/2 of the particles in a frame."""
-    return 0.5 * float(np.mean(np.sum(frames.read(int(frame), "velocity") ** 2, axis=1)))
+    """Return the kinetic energy <v'.v'>/2 of the particles in a frame. v' is the velocity minus its mean."""
+    return 0.5 * float(np.mean(np.sum(fluctuations(frames.read(int(frame), "velocity")) ** 2, axis=1)))
 
 
 def particle_series(frames: Frames, chosen: Sequence[int]) -> dict[str, np.ndarray]:
     """Return time series over the `chosen` frame numbers, by name.
 
-    Names are `time`, `energy` for <v.v>/2 and, if a density is stored, `density_rms` for its standard deviation.
+    Names are `time`, `energy` (`mean_energy`) and, if a density is stored, `density_rms` for its standard deviation.
     """
     columns = {"time": frames.times[np.asarray(chosen)],
                "energy": np.array([mean_energy(frames, frame) for frame in chosen])}
@@ -34,16 +34,16 @@ def particle_series(frames: Frames, chosen: Sequence[int]) -> dict[str, np.ndarr
 def error_series(run: Rollout) -> dict[str, np.ndarray]:
     """Return time series over the common frames of model and truth, by name.
 
-    Names are `time`, `velocity_error`, `no_force`, `velocity_kl` and `acceleration_kl`. `velocity_error` is the
-    normalised L2 error of the velocities. `no_force` is this error for particles that keep the true velocity of the
-    first common frame. `velocity_kl` and `acceleration_kl` are values of `pdf_divergence`.
+    Names are `time`, `velocity_error`, `no_force`, `velocity_kl` and `acceleration_kl`. `velocity_error` has values of
+    the function of this name. `no_force` is this error for particles that keep the true velocity of the first common
+    frame. `velocity_kl` and `acceleration_kl` are values of `pdf_divergence`.
     """
     rows, first = [], run.pair(0, "velocity").truth
     for index in range(run.common.times.size):
         velocity, acceleration = run.pair(index, "velocity"), run.pair(index, "acceleration")
-        rows.append((velocity.time, normalized_l2(velocity.model, velocity.truth),
+        rows.append((velocity.time, velocity_error(velocity.model, velocity.truth),
                      pdf_divergence(velocity, EDGES["velocity"]),
-                     pdf_divergence(acceleration, EDGES["acceleration"]), normalized_l2(first, velocity.truth)))
+                     pdf_divergence(acceleration, EDGES["acceleration"]), velocity_error(first, velocity.truth)))
     names = ("time", "velocity_error", "velocity_kl", "acceleration_kl", "no_force")
     return dict(zip(names, np.array(rows).T))
 

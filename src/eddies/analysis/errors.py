@@ -6,15 +6,36 @@ import numpy as np
 def normalized_l2(prediction: np.ndarray, truth: np.ndarray) -> float:
     """Return the normalised L2 error |prediction - truth| / |truth| over all entries of two arrays of the same shape.
 
-    Raises ValueError if the shapes differ or the truth is zero.
+    The result is NaN if the truth is zero. Raises ValueError if the shapes differ.
     """
-    prediction, truth = np.asarray(prediction, dtype=float), np.asarray(truth, dtype=float)
-    if prediction.shape != truth.shape:
-        raise ValueError(f"prediction has shape {prediction.shape}, truth {truth.shape}: they must be equal")
-    norm = np.linalg.norm(truth.ravel())
-    if norm == 0:
-        raise ValueError("the truth is zero everywhere: a normalised error has no meaning")
-    return float(np.linalg.norm((prediction - truth).ravel()) / norm)
+    return _relative(prediction, truth, np.asarray(truth, dtype=float))
+
+
+def velocity_error(prediction: np.ndarray, truth: np.ndarray) -> float:
+    """Return |prediction - truth| / |fluctuations(truth)| of velocities (n, 3) of the same particles.
+
+    A mean velocity depends on the frame of reference, so it is no part of the norm. The result is NaN if the truth has
+    no fluctuation. Raises ValueError if the shapes differ.
+    """
+    return _relative(prediction, truth, fluctuations(truth))
+
+
+def fluctuations(rows: np.ndarray) -> np.ndarray:
+    """Return rows (n, ...) minus their mean row, in double precision.
+
+    The result is zero if no fluctuation is above the round-off error of the mean.
+    """
+    rows = np.asarray(rows)
+    mean = rows.mean(axis=0, dtype=float)
+    found, least = rows - mean, 100 * np.finfo(rows.dtype).eps * np.abs(mean).max(initial=0.0)
+    return found if np.abs(found).max(initial=0.0) > least else np.zeros_like(found)
+
+
+def _relative(prediction: np.ndarray, truth: np.ndarray, norm: np.ndarray) -> float:
+    if np.shape(prediction) != np.shape(truth):
+        raise ValueError(f"prediction has shape {np.shape(prediction)}, truth {np.shape(truth)}: they must be equal")
+    error, size = np.linalg.norm(np.asarray(prediction, dtype=float) - truth), np.linalg.norm(norm)
+    return float(error / size) if size > 0 else np.nan
 
 
 def rms_log_ratio(prediction: np.ndarray, truth: np.ndarray) -> float:

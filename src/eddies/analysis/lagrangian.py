@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eddies.analysis.errors import rms_log_ratio
+from eddies.analysis.errors import fluctuations, rms_log_ratio
 from eddies.analysis.rollout import Frames, Rollout
 from eddies.parallel.migration import wrap
 
@@ -176,10 +176,11 @@ def tetrad_moments(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def correlation(initial: np.ndarray, later: np.ndarray) -> float:
-    """Return <v(0).v(t)> / sqrt(<v(0)^2> <v(t)^2>) of vectors v (n, 3) of the same particles at two times.
+    """Return <v(0).v(t)> / sqrt(<v(0)^2> <v(t)^2>) of vectors (n, 3) of the same particles at two times.
 
-    The result is NaN if all v(0) or all v(t) are 0.
+    v is the vector minus its mean over the particles. The result is NaN if all v(0) or all v(t) are 0.
     """
+    initial, later = fluctuations(initial), fluctuations(later)
     with np.errstate(invalid="ignore"):
         return float(np.sum(initial * later) / np.sqrt(np.sum(initial**2) * np.sum(later**2)))
 

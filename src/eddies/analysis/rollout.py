@@ -64,7 +64,7 @@ class Pair:
 class Plane:
     """Velocity (3, n, n) and vorticity magnitude (n, n) in the plane z = pi, reconstructed from particles.
 
-    The last two axes are y, x.
+    The velocity is relative to the mean over the particles. The last two axes are y, x.
     """
 
     velocity: np.ndarray

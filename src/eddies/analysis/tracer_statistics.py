@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from eddies.analysis.errors import fluctuations
 from eddies.analysis.lagrangian import lags_of, pair_dispersion, pairs_at, structure_function
 from eddies.analysis.pdfs import bin_edges, pdf
 from eddies.analysis.rollout import Frames
@@ -40,7 +41,8 @@ class TracerStatistics:
     Parameters
     ----------
     times, field_times : times of the frames since the first, (frames,), and of the stored fields, (fields,).
-    energy_ratio : <v.v> of the tracers divided by <v.v> of the filtered field, at `field_times`, (fields,).
+    energy_ratio : <v.v> of the tracers divided by <v.v> of the filtered field, at `field_times`, (fields,). v is the
+        velocity minus its mean.
     energy_error : standard deviation of this ratio for the same number of random points, (fields,).
     probability : PDF of an acceleration component divided by its rms at the same time, in the bins EDGES, (bins,).
         Accelerations are velocity differences of successive frames.
@@ -114,7 +116,7 @@ def _energy_ratio(tracers: Frames, spectra: Mapping[str, np.ndarray]) -> tuple[n
     ratios, errors = [], []
     for time, filtered in zip(spectra["time"], spectra["filtered"]):
         frame = int(np.argmin(np.abs(tracers.times - time)))
-        squared = np.sum(tracers.read(frame, "velocity") ** 2, axis=1)
+        squared = np.sum(fluctuations(tracers.read(frame, "velocity")) ** 2, axis=1)
         ratios.append(squared.mean() / (2 * filtered.sum()))
         errors.append(squared.std() / squared.mean() / np.sqrt(squared.size))
     return np.array(ratios), np.array(errors)

@@ -11,6 +11,7 @@ from eddies.clock import Clock
 from eddies.errors import UserError
 from eddies.flow.navier_stokes import Fluid, advective_speed
 from eddies.parallel.reduction import global_max, global_sum
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import RungeKutta4
 
 # Largest |z| on the imaginary and on the negative real axis in the stability region of the classical fourth-order
@@ -124,18 +125,21 @@ def advice(fluid: Fluid, limits: Sequence[StepLimit], kmax_eta: float, mach: flo
 def quadratic_energy(fluid: Fluid, state: np.ndarray) -> float:
     """Return <u.u>/2, plus c^2 <s^2>/2 for a compressible fluid, from the modes of a state; collective.
 
-    <.> is the mean over the box, and s = ln(rho / rho_0). The linear terms of the equations never raise this energy.
+    <.> is the mean over the box, u the velocity minus its mean, and s = ln(rho / rho_0) minus its mean. The linear
+    terms of the equations never raise this energy.
     """
-    energy = _half_square(state[:3])
+    grid = fluid.grid
+    energy = _half_square(grid, state[:3])
     if fluid.compressible:
-        energy += fluid.sound_speed**2 * _half_square(state[3:])
-    return float(global_sum(fluid.grid.decomposition.comm, energy))
+        energy += fluid.sound_speed**2 * _half_square(grid, state[3:])
+    return float(global_sum(grid.decomposition.comm, energy))
 
 
-def _half_square(modes: np.ndarray) -> float:
+def _half_square(grid: SpectralGrid, modes: np.ndarray) -> float:
     # Stored modes count twice, except the plane kx = 0, which holds its own mirror images.
-    plane = modes[..., 0]
-    return np.vdot(modes, modes).real - np.vdot(plane, plane).real / 2
+    plane = modes[..., 0] * (grid.index_squared[..., 0] > 0)
+    rest = modes[..., 1:]
+    return np.vdot(rest, rest).real + np.vdot(plane, plane).real / 2
 
 
 class StabilityWatch:

@@ -1,7 +1,8 @@
 """Statistics of a flow: energy budget, scales, spectrum, and moments of the velocity gradient.
 
-Velocities are given by their modes (3, kz, ky, kx). <.> is the mean over the box. All functions with a grid are
-collective.
+Velocities are given by their modes (3, kz, ky, kx). <.> is the mean over the box, and u is the velocity minus its mean:
+a mean velocity is no turbulence, and depends on the frame of reference. Only `total_energy` contains it. All functions
+with a grid are collective.
 """
 
 import numpy as np
@@ -13,19 +14,25 @@ from eddies.spectral.spectral_grid import SpectralGrid
 def energy_spectrum(grid: SpectralGrid, velocity: np.ndarray) -> np.ndarray:
     """Return the spectrum E(k), k = 0, 1, ...: E(k) is the energy of the modes whose |k| rounds to k.
 
-    |k| is in units of 2 pi / length. The sum of E(k) over k is <u.u>/2.
+    |k| is in units of 2 pi / length. The sum of E(k) over k is <u.u>/2, and E(0) is 0.
     """
     shells = int(np.ceil(np.sqrt(3) * grid.cutoff)) + 1
-    density = 0.5 * grid.multiplicity * (np.abs(velocity) ** 2).sum(axis=0)
+    density = 0.5 * grid.multiplicity * _squared(grid, velocity)
     spectrum = np.bincount(grid.shell_number.ravel(), density.ravel().astype(float), minlength=shells)
     return global_sum(grid.decomposition.comm, spectrum)
 
 
 def component_energies(grid: SpectralGrid, velocity: np.ndarray) -> dict[str, float]:
     """Return the energies <u_i^2>/2 of the three components under the names energy_x, energy_y and energy_z."""
-    halves = np.array([0.5 * np.sum(grid.multiplicity * np.abs(component) ** 2, dtype=float) for component in velocity])
+    halves = np.array([0.5 * np.sum(grid.multiplicity * _squared(grid, component[None]), dtype=float)
+                       for component in velocity])
     total = global_sum(grid.decomposition.comm, halves)
     return {f"energy_{axis}": float(energy) for axis, energy in zip("xyz", total)}
+
+
+def _squared(grid: SpectralGrid, velocity: np.ndarray) -> np.ndarray:
+    """Return |u(k)|^2 (kz, ky, kx) of modes (c, kz, ky, kx), without the zeroth mode."""
+    return (np.abs(velocity) ** 2).sum(axis=0) * (grid.index_squared > 0)
 
 
 def turbulence_scales(spectrum: np.ndarray, dissipation_rate: float, viscosity: float, cutoff: int) -> dict[str, float]:
@@ -82,7 +89,8 @@ def _skewness_and_flatness(moments: np.ndarray) -> tuple[float, float]:
 
 
 def incompressible_budget(grid: SpectralGrid, velocity: np.ndarray, viscosity: float) -> dict[str, float]:
-    """Return `total_energy`, which is <u.u>/2, and `dissipation_rate`, which is nu <|grad u|^2>, by name."""
+    """Return by name `total_energy`, half the mean square of the whole velocity, and `dissipation_rate`, which is
+    nu <|grad u|^2>."""
     squared = (np.abs(velocity) ** 2).sum(axis=0)
     return {"total_energy": 0.5 * grid.sum_modes(squared),
             "dissipation_rate": viscosity * grid.sum_modes(grid.wavenumber_squared * squared)}
@@ -92,10 +100,11 @@ def compressible_budget(grid: SpectralGrid, state: np.ndarray, viscosity: float,
                         sound_speed: float) -> dict[str, float]:
     """Return the energy budget of a compressible flow, and more statistics, by name.
 
-    `total_energy` is <rho |u|^2/2 + c^2 (rho ln rho - rho + 1)>. Without forcing it decays exactly at
-    `dissipation_rate`, nu <rho (2 S:S - 2/3 (div u)^2)>, where S is the rate of strain. `compressible_fraction` is the
-    share of <u.u> that belongs to the component of each mode along its wavevector. `density_rms` is the rms fluctuation
-    of rho, in units of rho_0. `skewness` and `flatness` are as in `gradient_moments`.
+    `total_energy` is <rho |v|^2/2 + c^2 (rho ln rho - rho + 1)> with the whole velocity v. Without forcing it decays
+    exactly at `dissipation_rate`, nu <rho (2 S:S - 2/3 (div u)^2)>, where S is the rate of strain.
+    `compressible_fraction` is the share of <u.u> that belongs to the component of each mode along its wavevector.
+    `density_rms` is the rms fluctuation of rho, in units of rho_0. `skewness` and `flatness` are as in
+    `gradient_moments`.
     """
     def with_gradients(modes: np.ndarray) -> list[np.ndarray]:
         return [modes[:4], (grid.d_dx, modes[:3]), (grid.d_dy, modes[:3]), modes[4:]]
@@ -112,7 +121,7 @@ def compressible_budget(grid: SpectralGrid, state: np.ndarray, viscosity: float,
         powers += _powers(diagonal)
     total = global_sum(grid.decomposition.comm, np.concatenate([sums, powers.ravel()])) / grid.cells**3
     along = np.abs(grid.along_wavevector(state[:3])) ** 2 * grid.inverse_squared
-    kinetic = grid.sum_modes((np.abs(state[:3]) ** 2).sum(axis=0))
+    kinetic = grid.sum_modes(_squared(grid, state[:3]))
     skewness, flatness = _skewness_and_flatness(total[4:].reshape(3, 3))
     return {"total_energy": float(total[0]),
             "dissipation_rate": viscosity * float(total[1]),

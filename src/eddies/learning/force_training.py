@@ -106,15 +106,19 @@ class TrainingFrame:
         self._within: KernelNeighborhood | None = None
 
     @cached_property
-    def fluctuation(self) -> Tensor:
-        """Scaled velocity fluctuation (v - <v>) d / u'^3, (n, 3); collective.
+    def relative_velocity(self) -> Tensor:
+        """Velocity minus its mean over all particles, (n, 3); collective."""
+        return self.particles.velocity - mean_over_ranks(self.decomposition.comm, self.particles.velocity)
 
-        <.> is the mean over all particles, d the filter width and u' the rms of one component of v - <v>. The scalar
-        product with an acceleration is the power in units of u'^3 / d.
+    @cached_property
+    def fluctuation(self) -> Tensor:
+        """Scaled velocity fluctuation v d / u'^3, (n, 3), of the `relative_velocity` v; collective.
+
+        d is the filter width and u' the rms of one component of v. The scalar product with an acceleration is the power
+        in units of u'^3 / d.
         """
-        velocity, comm = self.particles.velocity, self.decomposition.comm
-        velocity = velocity - mean_over_ranks(comm, velocity)
-        return velocity * (self.model.flow.scales.filter_width / root_mean_square(comm, velocity) ** 3)
+        velocity, width = self.relative_velocity, self.model.flow.scales.filter_width
+        return velocity * (width / root_mean_square(self.decomposition.comm, velocity) ** 3)
 
     def rows(self, ids: np.ndarray) -> Tensor:
         """Return the indices of those particles of this rank whose id is among `ids`."""
@@ -339,7 +343,7 @@ class ForceTrainer:
         if self.weights.acceleration_kl > 0:
             shares["acceleration_kl"] = self._divergence(truth / frame.acceleration_rms, error / frame.acceleration_rms)
         if self.weights.velocity_kl > 0:
-            velocity = frame.particles.velocity[rows].to(truth) / self.model.flow.scales.velocity
+            velocity = frame.relative_velocity[rows].to(truth) / self.model.flow.scales.velocity
             shares["velocity_kl"] = self._divergence(velocity, error / frame.acceleration_rms)
         return shares
 

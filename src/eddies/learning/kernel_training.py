@@ -9,6 +9,7 @@ from torch import Tensor
 from eddies.learning.losses import mean_square_share
 from eddies.learning.optimization import Adam, shared_values
 from eddies.parallel.reduction import global_sum
+from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.smoothing_kernels import KernelNetwork
 
@@ -22,14 +23,15 @@ class KernelSample:
     field, gradient : filtered velocity (m, 3) and its gradient (m, 3, 3) [component, direction] at the m grid points
         of the slab, z slowest.
 
-    `mean_square` holds two numbers: the mean square of a component of the filtered velocity over the whole grid, and
-    that of a component of its gradient. The constructor and `errors_of` are collective.
+    `mean_square` holds two numbers: the mean square of a component of the filtered velocity minus its mean, over the
+    whole grid, and that of a component of its gradient. The constructor and `errors_of` are collective.
     """
 
     def __init__(self, particles: ParticleField, field: Tensor, gradient: Tensor) -> None:
         self.particles, self.decomposition = particles, particles.decomposition
         self.field, self.gradient = field.to(particles.dtype), gradient.to(particles.dtype)
-        self.mean_square = self._mean_squares(self.field, self.gradient)
+        mean = mean_over_ranks(self.decomposition.comm, self.field.double()).to(self.field)
+        self.mean_square = self._mean_squares(self.field - mean, self.gradient)
 
     def own_rows(self, points: np.ndarray) -> Tensor:
         """Return the rows in `field` of those `points` that lie in this slab.

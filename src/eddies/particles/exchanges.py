@@ -8,7 +8,7 @@ from torch import Tensor
 
 from eddies.parallel.communicator import Comm
 from eddies.parallel.halo import HaloExchange
-from eddies.parallel.reduction import global_sum
+from eddies.parallel.reduction import global_max, global_sum
 from eddies.particles.particle_set import as_numpy
 
 
@@ -77,7 +77,22 @@ def root_mean_square(comm: Comm, values: Tensor) -> float:
 
 
 def relative_error(comm: Comm, error: Tensor, exact: Tensor) -> float:
-    """Normalised L2 error |error| / |exact| over the entries of all ranks, NaN if `exact` is zero; collective."""
+    """Normalised L2 error |error| / |exact| over the entries of all ranks, NaN if `exact` is zero; collective.
+
+    For velocities, `exact` are their `fluctuations`: a mean velocity depends on the frame of reference.
+    """
     square, whole = global_sum(comm, np.array([float(part.detach().double().square().sum())
                                                for part in (error, exact)]))
     return float(np.sqrt(square / whole)) if whole > 0 else np.nan
+
+
+def fluctuations(comm: Comm, rows: Tensor) -> Tensor:
+    """Return rows (n, c) minus their mean over all ranks, in double precision; collective.
+
+    The result is zero if no fluctuation is above the round-off error of the mean.
+    """
+    total = global_sum(comm, np.append(as_numpy(rows.double().sum(0)), len(rows)))
+    mean = torch.from_numpy(total[:-1] / max(total[-1], 1.0)).to(rows.device)
+    found, least = rows.double() - mean, 100 * torch.finfo(rows.dtype).eps * float(mean.abs().max())
+    largest = float(global_max(comm, float(found.abs().max()) if found.numel() else 0.0))
+    return found if largest > least else torch.zeros_like(found)

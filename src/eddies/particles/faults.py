@@ -14,9 +14,11 @@ from eddies.particles.periodic_box import PeriodicBox
 
 @dataclass(frozen=True)
 class Limits:
-    """Largest allowed speed and, for particles with a density, largest deviation of the density from `density_mean`."""
+    """Largest allowed speed relative to the velocity `frame` (3,) and, for particles with a density, largest deviation
+    of the density from `density_mean`."""
 
     speed: float
+    frame: Tensor
     density_mean: float = 0.0
     density_deviation: float = math.inf
 
@@ -27,7 +29,8 @@ def find_fault(particles: ParticleSet, limits: Limits, box: PeriodicBox, step: i
     The description contains step, rank, particle id, position, velocity, density and the nearest particle of the rank.
     """
     # Comparisons with NaN are false, so the test selects sound particles.
-    sound = torch.linalg.vector_norm(particles.velocity, dim=1) <= limits.speed
+    speed = torch.linalg.vector_norm(particles.velocity - limits.frame.to(particles.velocity), dim=1)
+    sound = speed <= limits.speed
     sound &= torch.isfinite(particles.position).all(1)
     if particles.density is not None:
         sound &= torch.isfinite(particles.density)
@@ -37,7 +40,7 @@ def find_fault(particles: ParticleSet, limits: Limits, box: PeriodicBox, step: i
     row = int(torch.nonzero(~sound)[0])
     if not all(bool(torch.isfinite(column[row]).all()) for column in particles.columns().values()):
         complaint = "not finite"
-    elif float(torch.linalg.vector_norm(particles.velocity[row])) > limits.speed:
+    elif float(speed[row]) > limits.speed:
         complaint = f"speed above the limit {limits.speed:.6g}"
     else:
         complaint = (f"density differs by more than {limits.density_deviation:.6g} from the mean "

@@ -18,9 +18,8 @@ from eddies.parallel.reduction import global_sum
 BEYOND_NYQUIST, BEYOND_DISSIPATION, LEAST_TRANSFER = 1.5, 1.05, 0.02
 MAY_VANISH = ("viscosity", "kolmogorov_length")
 MEAN_DENSITY = 1.0
-# Columns that change along a trajectory, the names of their rates of change, and their means.
+# Columns that change along a trajectory, and the names of their rates of change.
 RATES = {"velocity": "acceleration", "density": "density_rate"}
-MEANS = {"velocity": 0.0, "density": MEAN_DENSITY}
 
 Columns = Mapping[str, np.ndarray]
 
@@ -37,7 +36,7 @@ class ReferenceScales:
     ----------
     filter_width : d of the filter, the unit of length in Eq. 4.
     spacing : mean distance of particles, (box volume / particles)^(1/3).
-    velocity : rms of one velocity component; its mean is not subtracted.
+    velocity : rms of one velocity component about its mean over the particles.
     acceleration : rms of one component of the acceleration along trajectories.
     density_mean : mean density rho_0.
     viscosity : kinematic viscosity nu of the fluid; may be 0.
@@ -124,17 +123,23 @@ class FlowUnits:
 def measured_scales(comm: Comm, at: Columns, after: Columns, interval: float) -> dict[str, float]:
     """Measure the rms of velocity, density and their rates of change over all particles; collective.
 
-    The rms of a vector is that of one component. Returns "velocity_rms" and "density_rms" (of the fluctuation) in the
-    frame `at`. Returns also "acceleration_rms" and "density_rate_rms", the rms of the change from `at` to the frame
-    `after`, divided by `interval`, the time between the two frames. Both frames are this rank's rows of `velocity`
-    (n, 3) and, optionally, `density` (n,), of the same particles.
+    The rms of a vector is that of one component. Returns "velocity_rms" (about the mean over the particles) and
+    "density_rms" (about MEAN_DENSITY) in the frame `at`. Returns also "acceleration_rms" and "density_rate_rms", the
+    rms of the change from `at` to the frame `after`, divided by `interval`, the time between the two frames. Both
+    frames are this rank's rows of `velocity` (n, 3) and, optionally, `density` (n,), of the same particles.
     """
     scales = {}
     for name, rate in RATES.items():
         if name in at:
-            scales[f"{name}_rms"] = _rms(comm, at[name] - MEANS[name])
+            mean = MEAN_DENSITY if name == "density" else _mean(comm, at[name])
+            scales[f"{name}_rms"] = _rms(comm, at[name] - mean)
             scales[f"{rate}_rms"] = _rms(comm, (after[name] - at[name]) / interval)
     return scales
+
+
+def _mean(comm: Comm, rows: np.ndarray) -> np.ndarray:
+    *total, count = global_sum(comm, np.append(rows.sum(axis=0, dtype=float), len(rows)))
+    return np.array(total) / count
 
 
 def _rms(comm: Comm, values: np.ndarray) -> float:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from eddies.kernels.splines import Splines
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.exchanges import sum_over_ranks
 from eddies.particles.particle_set import as_numpy
 from eddies.particles.rates import Rates
 from eddies.spectral.interpolation import SplineInterpolation
@@ -46,6 +47,8 @@ class FourierGrid(ModeOperators):
         #: number of times that a stored mode occurs in a sum over all modes
         self.multiplicity = torch.from_numpy(self.spectral.multiplicity)
         self._sphere = (self.shell <= resolved).to(dtype)  # a product is twice as fast as `where`
+        #: 1 for k = 0, 0 for all other modes
+        self._zeroth = (self.shell == 0).to(dtype)
         self._transfers: dict[float, Tensor] = {}
 
     # ---- linear maps
@@ -78,6 +81,24 @@ class FourierGrid(ModeOperators):
 
     def zeros(self, *leading: int) -> Tensor:
         return torch.zeros(*leading, *self.spectral.spectral_shape, dtype=self.dtype.to_complex())
+
+    # ---- the zeroth mode, which is the mean over the box
+
+    def mean(self, modes: Tensor) -> Tensor:
+        """Return the mean (c,) over the box of fields with the given modes (c, kz, ky, kx), on all ranks.
+
+        The mean is in double precision. Collective, differentiable.
+        """
+        own = (modes.real * self._zeroth).sum((1, 2, 3), dtype=torch.float64)
+        return sum_over_ranks(self.decomposition.comm, own)
+
+    def with_mean(self, modes: Tensor, mean: Tensor) -> Tensor:
+        """Add the `mean` (c,) to the zeroth mode of each field."""
+        return modes + mean.to(self.dtype)[:, None, None, None] * self._zeroth
+
+    def without_mean(self, modes: Tensor) -> Tensor:
+        """Set the zeroth mode to zero."""
+        return modes * (1 - self._zeroth)
 
     # ---- formulas on modes
 

@@ -45,7 +45,7 @@ class LeastSquares:
 
     Parameters
     ----------
-    inside : bool (kz, ky, kx), whether a mode is solved for.
+    inside : bool (kz, ky, kx), whether a mode is solved for. The zeroth mode is the mean of the velocity.
     penalty : (kz, ky, kx), real, 0 for modes that are not solved for.
     """
 

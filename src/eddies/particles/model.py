@@ -224,8 +224,8 @@ class LagrangianModel(nn.Module):
     def _at_particles(self, rates: Rates, context: Context) -> Rates:
         """Return the rates with their modes interpolated to the particles.
 
-        The mean over the particles of the interpolated force is subtracted, so the momentum is conserved. The mean of
-        the force over space is zero, but particles do not sample space evenly.
+        The mean over the box of the force is zero, so the momentum of the flow is conserved. That of the particles is
+        not: particles do not sample the box evenly.
         """
         pressure = rates.pressure_modes if self.density_is_given else None
         modes = [part for part in (rates.force_modes, None if pressure is None else pressure[None]) if part is not None]
@@ -234,7 +234,7 @@ class LagrangianModel(nn.Module):
             return parts[0]
         values = context.resolved.at_particles(torch.cat(modes)).to(context.particles.velocity)
         if rates.force_modes is not None:
-            parts.append(Rates(acceleration=context.without_mean(values[:, :3])).at(context.rows))
+            parts.append(Rates(acceleration=values[:, :3]).at(context.rows))
         if pressure is not None:
             scales = context.flow.scales
             parts.append(Rates(density=values[:, -1] * (scales.density_mean / scales.required("sound_speed") ** 2)))

@@ -12,7 +12,7 @@ from eddies.kernels.pairs import PairSpace
 from eddies.kernels.reconstruction import fitted, kernel_numbers, sums_on_grid
 from eddies.parallel.halo import HaloExchange
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.exchanges import with_ghosts
+from eddies.particles.exchanges import mean_over_ranks, with_ghosts
 from eddies.particles.kriging import interpolated
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.pairs import CompiledSum, Pairs, compiled_sums
@@ -37,6 +37,9 @@ class ParticleField:
     Along each axis the grid has as many cells as all slabs together have planes. The grid points of this rank are
     numbered with x fastest and z slowest.
 
+    Averages and fits are made of velocities relative to their mean over the particles, which is then added. So a mean
+    velocity changes no result, also with a kernel whose sums are not normalised, and costs no precision.
+
     Parameters
     ----------
     decomposition : slabs that hold the particles.
@@ -51,7 +54,8 @@ class ParticleField:
         self._box = PeriodicBox(decomposition.length, periodic_z=decomposition.size == 1)
         self.halo = HaloExchange(decomposition, as_numpy(position), support)
         self._position = with_ghosts(self.halo, position, positions=True)
-        self._velocity = with_ghosts(self.halo, velocity).to(dtype)
+        mean = mean_over_ranks(decomposition.comm, velocity.double())
+        self._velocity, self._mean = with_ghosts(self.halo, velocity - mean.to(velocity)).to(dtype), mean.to(dtype)
         self.points = grid_points(decomposition, decomposition.planes)
         self._entries: Tensor | None = None
         self._latest: tuple[SmoothingKernel, Tensor] | None = None  # kernel and result of the last call of `volumes`
@@ -92,7 +96,8 @@ class ParticleField:
         `volume` (s,) is the result of `volumes`. Differentiable in the kernel and the volumes.
         """
         pairs = self._around.pairs(self.points, self._position, rows, self.dtype)
-        return reconstruct_with_gradient(kernel, pairs, volume, self._velocity)
+        velocity, gradient = reconstruct_with_gradient(kernel, pairs, volume, self._velocity)
+        return velocity + self._mean, gradient
 
     # ---- methods of the compiled library, which record no gradient
 
@@ -109,7 +114,7 @@ class ParticleField:
         factor = normalisation(kernel, sums[:1])
         average = sums[1:4] * factor
         gradient = (sums[7:].reshape(3, 3, -1) - average.unsqueeze(1) * sums[4:7]) * factor
-        return average.T, gradient.permute(2, 0, 1)
+        return average.T + self._mean, gradient.permute(2, 0, 1)
 
     @torch.no_grad()
     def averaged_on_grid(self, kernel: SmoothingKernel) -> Tensor:
@@ -118,7 +123,7 @@ class ParticleField:
         weighted = volume.unsqueeze(1) * torch.cat([torch.ones_like(volume).unsqueeze(1), self._velocity], dim=1)
         sums = torch.from_numpy(sums_on_grid(self._box, slab.planes, range(slab.start, slab.stop), _for_library(kernel),
                                              self._position.numpy(), weighted.numpy()))
-        return sums[:, 1:] * normalisation(kernel, sums[:, :1])
+        return sums[:, 1:] * normalisation(kernel, sums[:, :1]) + self._mean
 
     @torch.no_grad()
     def fitted(self, kernel: SmoothingKernel, degree: int, mean_volume: float,
@@ -131,14 +136,14 @@ class ParticleField:
             V sum_j W(x - x_j) |p(x_j) - A_j|^2 + RIDGE (sum of the squares of all coefficients except the constant).
 
         V is the `mean_volume` of a particle, so V sum_j W is one on average. Where neighbours are few, distant or badly
-        placed, the ridge dominates, and the result is close to the average with the weight W. It is zero where no
-        particle lies within the support.
+        placed, the ridge dominates, and the result is close to the average with the weight W. It is the mean velocity
+        of the particles where no particle lies within the support.
         """
         neighbors = self._neighbors_of(receivers)
         values = fitted(self._box, degree, _for_library(kernel), mean_volume, RIDGE, neighbors.offsets.numpy(),
                         neighbors.senders.numpy(), receivers.numpy(), self._position.numpy(), self._velocity.numpy())
         result = torch.from_numpy(values).to(self.dtype)
-        return result[:, 0], result[:, 1:].transpose(1, 2)
+        return result[:, 0] + self._mean, result[:, 1:].transpose(1, 2)
 
     @torch.no_grad()
     def kriged(self, filter_width: float, receivers: Tensor) -> tuple[Tensor, Tensor]:
@@ -149,7 +154,8 @@ class ParticleField:
         neighbors = self._neighbors_of(receivers)
         blocks = [interpolated(neighbors.pairs(receivers, self._position, block, self.dtype), self.support,
                                filter_width, self._velocity) for block in neighbors.blocks(KRIGED_TOGETHER)]
-        return torch.cat([velocity for velocity, _ in blocks]), torch.cat([gradient for _, gradient in blocks])
+        velocity, gradient = map(torch.cat, zip(*blocks))
+        return velocity + self._mean, gradient
 
     def _sums(self, kernel: SmoothingKernel, kind: str, components: int, position: Tensor, count: int,
               scalars: tuple[Tensor, ...] = ()) -> Tensor:

@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 
 from eddies.parallel.reduction import global_sum
-from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.least_squares import LeastSquares
-from eddies.particles.particle_set import ParticleSet, as_numpy
+from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
 
 ANGLE = 0.5  # upper limit of u' k_c dt in a substep dt of the forecast
@@ -30,7 +29,7 @@ class RememberedVelocity:
     For N evenly spread particles, 1/V = N/e + 1/(variance of the previous prior). e is the energy of a velocity
     component that the solver expects beyond its modes. So modes that few particles determine collect the information
     of several frames. Forecasts solve the Navier-Stokes equations for the velocity before the filter, in the modes of
-    the solver.
+    the solver. The zeroth mode has no prior: each frame determines it.
 
     Parameters
     ----------
@@ -50,54 +49,53 @@ class RememberedVelocity:
     weight: float = 1.0
 
     def __post_init__(self) -> None:
-        self._latest: tuple[float, Tensor, np.ndarray] | None = None
+        self._latest: tuple[float, Tensor] | None = None
         self._penalty = self.solver.equations.penalty  # sigma^2 over the variance of the latest prior
         self._count = 0.0
 
     @torch.no_grad()
     def of(self, particles: ParticleSet, time: float) -> Tensor:
-        """Estimate the modes (3, kz, ky, kx) of the velocity that particles resolve, relative to their mean velocity.
+        """Estimate the modes (3, kz, ky, kx) of the velocity that particles resolve.
 
         `time` must be later than in the previous call.
         """
-        grid, comm = self.solver.grid, self.solver.grid.decomposition.comm
-        mean = mean_over_ranks(comm, particles.velocity)
-        relative = particles.velocity - mean
-        count, square = global_sum(comm, np.array([len(relative), float(relative.square().sum())]))
+        grid, comm, count = self.solver.grid, self.solver.grid.decomposition.comm, len(particles.velocity)
         if self._latest is None:
-            modes = self.solver.of(particles).velocity
+            modes = self.solver.of(particles).modes
+            count = global_sum(comm, count)
         else:
-            before, latest, drift = self._latest
-            step = time - before
+            before, latest = self._latest
+            mean, latest, step = grid.mean(latest), grid.without_mean(latest), time - before
+            count, square = global_sum(comm, np.array([count, float((particles.velocity - mean).square().sum())]))
             turn = step * grid.wavenumber_squared.sqrt() * self._speed(latest / self.transfer)
             worth, points = torch.exp(-turn / (2 * self.memory)), grid.points(particles.position)
             self._penalty = self._next_penalty(worth)
             equations = LeastSquares(grid, self.solver.equations.inside, self._penalty)
-            prior = worth * self.solver.advected(self.forecast(latest, step), step, drift)
-            missing = relative - grid.at(prior, points)
+            prior = grid.with_mean(worth * self.solver.advected(self.forecast(latest, step), step, mean), mean)
+            missing = particles.velocity - grid.at(prior, points)
             right = equations.descent(missing, points, torch.zeros_like(prior))
             change = equations.solve(points, right, count, self.solver.tolerance**2 * square, None,
                                      self.solver.most_iterations)
             modes = prior + change.modes
-        self._latest, self._count = (time, modes, as_numpy(mean)), count
+        self._latest, self._count = (time, modes), float(count)
         return modes
 
     def state_dict(self) -> dict[str, Any]:
         """State for the next moment; empty before the first. `modes` and `penalty` are tensors of the latest estimate.
-        `time`, the particles' mean velocity `drift` and their number `count` are plain values."""
+        `time` and the number of particles `count` are plain values."""
         if self._latest is None:
             return {}
-        time, modes, drift = self._latest
-        return {"modes": modes, "penalty": self._penalty, "time": time, "drift": drift.tolist(), "count": self._count}
+        time, modes = self._latest
+        return {"modes": modes, "penalty": self._penalty, "time": time, "count": self._count}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Inverse of `state_dict`."""
         if state:
-            self._latest = state["time"], state["modes"], np.array(state["drift"])
+            self._latest = state["time"], state["modes"]
             self._penalty, self._count = state["penalty"], state["count"]
 
     def forecast(self, modes: Tensor, step: float) -> Tensor:
-        """Return the modes after the time `step`, by Runge-Kutta substeps of fourth order."""
+        """Return the modes, with mean zero, after the time `step`, by Runge-Kutta substeps of fourth order."""
         whole = modes / self.transfer
         highest = self.solver.grid.resolved * 2 * math.pi / self.solver.grid.decomposition.length
         steps = max(math.ceil(step * highest * self._speed(whole) / ANGLE), 1)
@@ -117,10 +115,10 @@ class RememberedVelocity:
 
     def _next_penalty(self, worth: Tensor) -> Tensor:
         """Return sigma^2 divided by the variance of the next prior. `worth` is beta."""
-        first, inside = self.solver.equations.penalty, self.solver.equations.inside
-        before = max(self.weight, 1.0) * self._count + self._penalty
-        variance = worth**2 / before + (1 - worth**2) / torch.where(inside, first, 1.0)
-        return torch.where(inside, 1 / variance, 0.0)
+        first = self.solver.equations.penalty
+        before, limited = max(self.weight, 1.0) * self._count + self._penalty, first > 0
+        variance = worth**2 / before + (1 - worth**2) / torch.where(limited, first, 1.0)
+        return torch.where(limited, 1 / variance, 0.0)
 
     def _speed(self, modes: Tensor) -> float:
         """Return the rms u' of a component of the velocity with these modes; collective."""

@@ -20,7 +20,7 @@ from eddies.particles.flow_units import ReferenceScales, resolved_wavenumber
 from eddies.particles.fourier_grid import FourierGrid, Points
 from eddies.particles.least_squares import LeastSquares, Solution
 from eddies.particles.neighborhood import farthest_outside
-from eddies.particles.particle_set import ParticleSet, as_numpy
+from eddies.particles.particle_set import ParticleSet
 from eddies.spectral.mode_operators import gaussian_transfer
 
 # Exponent of the prior's power law, the two constants of its dissipation range (Pope 2000, Eq. 6.248), and the ratio of
@@ -45,9 +45,10 @@ class ResolvedFlow:
     Parameters
     ----------
     grid : grid of the modes.
-    velocity : modes (3, kz, ky, kx), solenoidal, |k| <= `grid.resolved`.
+    mean : (3,), the mean of the resolved velocity over the box, its zeroth mode.
+    velocity : modes (3, kz, ky, kx) of the resolved velocity minus `mean`, solenoidal, 0 < |k| <= `grid.resolved`.
     points : the owned particles on the grid.
-    relative_velocity : (n, 3), velocity of the particles minus its mean over the particles of all ranks.
+    relative_velocity : (n, 3), velocity of the particles minus `mean`.
     filter_width : d of the filter that the particles' velocity has passed.
     left_over : (n, 3), the result of `missing` if it is known, else None.
     iterations, residual : number of iterations of the solve, and its final residual relative to the velocities.
@@ -55,6 +56,7 @@ class ResolvedFlow:
     """
 
     grid: FourierGrid
+    mean: Tensor
     velocity: Tensor
     points: Points
     relative_velocity: Tensor
@@ -74,12 +76,17 @@ class ResolvedFlow:
             return self.left_over
         return self.relative_velocity - self.at_particles(self.velocity).to(self.relative_velocity)
 
+    @property
+    def modes(self) -> Tensor:
+        """Modes (3, kz, ky, kx) of the resolved velocity, with its mean as the zeroth mode."""
+        return self.grid.with_mean(self.velocity, self.mean)
+
     @cached_property
     def spectrum(self) -> Tensor:
         """E(k) (k_c + 1,), the energy of the modes whose |k| rounds to k = 0, 1, ..., k_c, over all ranks.
 
         |k| is in units of the smallest wavenumber. The last shell holds only modes up to k_c. The sum of E is <u.u>/2
-        of the resolved velocity u. Collective, differentiable.
+        of the resolved velocity u minus its mean. Collective, differentiable.
         """
         grid = self.grid
         energy = 0.5 * grid.multiplicity * (self.velocity.real.square() + self.velocity.imag.square()).sum(0)
@@ -132,15 +139,16 @@ class ResolvedFlow:
 
 
 class ResolvedVelocity:
-    """Computes the `ResolvedFlow` of particles: the solenoidal modes u(k), 0 < |k| <= k_c, that
+    """Computes the `ResolvedFlow` of particles: the solenoidal modes u(k), |k| <= k_c, that
 
         minimise  sum_i |v_i - u(x_i)|^2  +  sum_k (sigma^2 / P_k) |u(k)|^2
 
-    as for measured particle tracks (Gesemann et al. 2016). The velocities v_i are relative to their mean over all
-    particles. P_k ~ k^(-11/3) f(k eta) G^2 is the expected energy of a component of a mode. f describes the dissipation
-    range of the spectrum, and G is the transfer function of the filter. sigma^2 is `weight` times the energy of a
-    velocity component that this law predicts beyond k_c; this energy acts as noise on the modes up to k_c. Since the
-    filtered velocity is smooth and solenoidal, modes beyond the particles' Nyquist wavenumber are determined too.
+    as for measured particle tracks (Gesemann et al. 2016). The zeroth mode, the mean of u over the box, has no penalty.
+    It is not the mean over the particles, because particles do not sample the box evenly. P_k ~ k^(-11/3) f(k eta) G^2
+    is the expected energy of a component of a mode. f describes the dissipation range of the spectrum, and G is the
+    transfer function of the filter. sigma^2 is `weight` times the energy of a velocity component that this law predicts
+    beyond k_c; this energy acts as noise on the modes up to k_c. Since the filtered velocity is smooth and solenoidal,
+    modes beyond the particles' Nyquist wavenumber are determined too.
 
     The solve uses conjugate gradients, preconditioned by 1 / (N + 5 sigma^2/P_k). It ends when the norm of the
     preconditioned residual is `tolerance` times that of the velocities, or after a given number of `iterations`. A
@@ -172,10 +180,10 @@ class ResolvedVelocity:
     def __init__(self, grid: FourierGrid, filter_width: float, kolmogorov_length: float = 0.0,
                  weight: float = WEIGHT) -> None:
         self.grid, self.filter_width = grid, filter_width
-        inside = (grid.shell > 0) & (grid.shell <= grid.resolved)
-        energy, unresolved = _prior(grid, filter_width, kolmogorov_length, inside)
-        penalty = torch.where(inside, weight * unresolved / (3 * torch.where(inside, energy, 1.0)), 0.0)
-        self.equations = LeastSquares(grid, inside, penalty)
+        penalized = (grid.shell > 0) & (grid.shell <= grid.resolved)
+        energy, unresolved = _prior(grid, filter_width, kolmogorov_length, penalized)
+        penalty = torch.where(penalized, weight * unresolved / (3 * torch.where(penalized, energy, 1.0)), 0.0)
+        self.equations = LeastSquares(grid, grid.shell <= grid.resolved, penalty)
         self.forget()
 
     @classmethod
@@ -195,30 +203,34 @@ class ResolvedVelocity:
     def of(self, particles: ParticleSet, time: float | None = None, near: Tensor | None = None) -> ResolvedFlow:
         """Compute the resolved flow of particles.
 
-        The solve starts from the prediction for `time` if this is given, else from the modes `near` (3, kz, ky, kx), or
-        from zero without either.
+        The solve starts from the prediction for `time` if this is given, else from the modes `near` (3, kz, ky, kx) of
+        a velocity, or from zero without either. Velocities in the solve are relative to the mean over the particles;
+        this choice has no effect on the minimum.
         """
         reach = self.grid.reach
         if farthest_outside(self.grid.decomposition, particles) >= reach:
             raise HaloError(f"a particle is more than {reach:.3g} outside the slab of its rank, where the "
                             "ghost planes end; shorten the time step or the skin")
         comm = self.grid.decomposition.comm
-        mean = mean_over_ranks(comm, particles.velocity)
-        relative, points = particles.velocity - mean, self.grid.points(particles.position)
-        flow = ResolvedFlow(self.grid, self.grid.zeros(3), points, relative, self.filter_width)
+        frame = mean_over_ranks(comm, particles.velocity.detach())
+        relative, points = particles.velocity - frame, self.grid.points(particles.position)
+        flow = ResolvedFlow(self.grid, frame, self.grid.zeros(3), points, relative, self.filter_width)
         with torch.no_grad():
             count, square = global_sum(comm, np.array([len(relative), float(relative.double().square().sum())]))
             speed = math.sqrt(square / (3 * count)) if count else 0.0
-            start = None if near is None else self.equations.projected(near)
-            if time is not None:
-                start = self.predicted(time, as_numpy(mean), speed)
+            start = self.predicted(time, speed) if time is not None else near
+            if start is not None:
+                start = self.equations.projected(self.grid.with_mean(start, -frame))
             flow = self._solved(flow, start, count, square)
         self.solves.append((flow.iterations, flow.residual, flow.converged))
-        self.latest = flow.velocity.detach()
         if torch.is_grad_enabled():
             flow = replace(flow, left_over=None)  # it has no gradient
             descent = self.equations.descent(flow.missing(), flow.points, flow.velocity)
             flow = replace(flow, velocity=_Solution.apply(descent, flow.velocity, self._adjoint(flow)))
+        drift = self.grid.mean(flow.velocity)
+        flow = replace(flow, mean=frame + drift, velocity=self.grid.without_mean(flow.velocity),
+                       relative_velocity=relative - drift.to(relative))
+        self.latest = flow.modes.detach()
         return flow
 
     def band_energies(self, particles: ParticleSet, near: Tensor | None = None) -> Tensor:
@@ -241,19 +253,19 @@ class ResolvedVelocity:
         """
         rate = self.equations.projected((0 if force is None else force.detach()) - flow.convection)
         self._moments = [moment for moment in self._moments if moment.time != time][-1:]
-        self._moments.append(_Moment(time, flow.velocity.detach(), rate))
+        self._moments.append(_Moment(time, flow.mean.detach(), flow.velocity.detach(), rate))
         self.speed = float(flow.rms)
 
-    def predicted(self, time: float, mean: np.ndarray, speed: float) -> Tensor | None:
+    def predicted(self, time: float, speed: float) -> Tensor | None:
         """Predict the modes at a time; None without earlier evaluations.
 
         The nearer of the last two evaluations at different times is extrapolated with the rates of both (Adams and
-        Bashforth). The field moves with the mean velocity (3,) of the particles. Each mode is multiplied by a factor
-        that decreases with its expected error. A velocity u' = `speed`, the rms of a component, turns the phase of a
-        mode by theta = k u' dt in a time dt. The relative error of the prediction is then (5/12) theta^3; its rms over
-        normally distributed velocities is 1.6 theta^3. The factor 1 / (1 + (2 theta)^6) removes modes that velocities
-        of two or three u' would spoil. A wrong mode is worse than a missing one: the solve corrects it only near
-        particles, and it grows elsewhere.
+        Bashforth). The field moves with the mean velocity of this evaluation, which does not change. Each mode is
+        multiplied by a factor that decreases with its expected error. A velocity u' = `speed`, the rms of a component,
+        turns the phase of a mode by theta = k u' dt in a time dt. The relative error of the prediction is then (5/12)
+        theta^3; its rms over normally distributed velocities is 1.6 theta^3. The factor 1 / (1 + (2 theta)^6) removes
+        modes that velocities of two or three u' would spoil. A wrong mode is worse than a missing one: the solve
+        corrects it only near particles, and it grows elsewhere.
         """
         if not self._moments:
             return None
@@ -261,9 +273,9 @@ class ResolvedVelocity:
         step, rate = time - near.time, near.rate
         for other in others:
             between = near.time - other.time
-            rate = rate + step / (2 * between) * (rate - self.advected(other.rate, between, mean))
+            rate = rate + step / (2 * between) * (rate - self.advected(other.rate, between, near.mean))
         worth = 1 / (1 + (2 * self.grid.wavenumber_squared.sqrt() * speed * step) ** 6)
-        return worth * self.advected(near.velocity + step * rate, step, mean)
+        return self.grid.with_mean(worth * self.advected(near.velocity + step * rate, step, near.mean), near.mean)
 
     def forget(self) -> None:
         """Discard predictions: the next solve starts from zero."""
@@ -273,21 +285,24 @@ class ResolvedVelocity:
         self.speed = 0.0
 
     def state_dict(self) -> dict[str, Tensor]:
-        """State for later solves: `times` (m,) of the stored moments, `modes` (m, 2, 3, kz, ky_local, kx) of velocity
-        and rate at these times, and `speed`."""
+        """State for later solves: `times` (m,) of the stored moments, at these times the `means` (m, 3) of the velocity
+        and the `modes` (m, 2, 3, kz, ky_local, kx) of velocity and rate, and `speed`."""
+        means = [moment.mean for moment in self._moments]
         modes = [torch.stack([moment.velocity, moment.rate]) for moment in self._moments]
         return {"times": torch.tensor([moment.time for moment in self._moments], dtype=torch.float64),
+                "means": torch.stack(means) if means else torch.zeros(0, 3, dtype=torch.float64),
                 "modes": torch.stack(modes) if modes else self.grid.zeros(0, 2, 3),
                 "speed": torch.tensor(self.speed, dtype=torch.float64)}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         modes = state["modes"].to(self.grid.dtype.to_complex())
-        self._moments = [_Moment(float(time), *pair) for time, pair in zip(state["times"], modes)]
+        self._moments = [_Moment(float(time), mean, *pair)
+                         for time, mean, pair in zip(state["times"], state["means"], modes)]
         self.speed = float(state["speed"])
 
-    def advected(self, modes: Tensor, step: float, mean: np.ndarray) -> Tensor:
-        """Return the modes of a field after it has moved with the `mean` velocity for the time `step`."""
-        turns = [torch.exp(-1j * step * velocity * k) for k, velocity in zip(self.grid.wavevector, mean)]
+    def advected(self, modes: Tensor, step: float, mean: Tensor) -> Tensor:
+        """Return the modes of a field after it has moved with the `mean` velocity (3,) for the time `step`."""
+        turns = [torch.exp(-1j * step * velocity * k) for k, velocity in zip(self.grid.wavevector, mean.tolist())]
         return math.prod(turns) * modes
 
     # ---- the solve
@@ -337,9 +352,10 @@ class ResolvedVelocity:
 
 
 class _Moment(NamedTuple):
-    """Modes of the resolved velocity, and of its rate of change, at one time."""
+    """Mean and other modes of the resolved velocity, and its rate of change, at one time."""
 
     time: float
+    mean: Tensor
     velocity: Tensor
     rate: Tensor
 

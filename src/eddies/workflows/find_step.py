@@ -35,7 +35,7 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import IdOrder
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
-from eddies.particles.exchanges import relative_error
+from eddies.particles.exchanges import fluctuations, relative_error
 from eddies.pipeline import STAGES
 from eddies.scene.integrators import MOST_COURANT, SCHEMES
 from eddies.scene.scene import Scene, SceneError, Simulation
@@ -80,9 +80,10 @@ class Stretch:
         self.end = truth.block(self.frame + count * every, ("velocity",))["velocity"]
 
     def distance(self, one: np.ndarray, other: np.ndarray) -> float:
-        """Return the rms difference of two final velocities, divided by the rms of the true one; collective."""
-        return relative_error(self.truth.decomposition.comm, torch.from_numpy(one.astype(np.float64) - other),
-                              torch.from_numpy(self.end))
+        """Return the rms difference of two final velocities over the rms fluctuation of the true one; collective."""
+        comm = self.truth.decomposition.comm
+        return relative_error(comm, torch.from_numpy(one.astype(np.float64) - other),
+                              fluctuations(comm, torch.from_numpy(self.end)))
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
-from eddies.particles.exchanges import mean_over_ranks, relative_error
+from eddies.particles.exchanges import fluctuations, relative_error
 from eddies.particles.forms import Form
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.particle_field import ParticleField
@@ -45,7 +45,7 @@ log = logging.getLogger("eddies")
 
 
 class Method(Protocol):
-    """Computes the modes (3, kz, ky, kx) of the particles' velocity minus its mean, frame by frame."""
+    """Computes the modes (3, kz, ky, kx) of the particles' velocity, frame by frame."""
 
     def of(self, particles: ParticleSet, time: float) -> Tensor:
         """Return the modes at a time; collective."""
@@ -69,8 +69,7 @@ class NeighbourMethod(Method):
         slab = self._grid.decomposition
         field = ParticleField(slab, self._form.support, particles.position, particles.velocity)
         velocity = self._form.on_grid(field).T.reshape(3, slab.count, slab.planes, slab.planes)
-        mean = mean_over_ranks(slab.comm, particles.velocity).to(self._grid.dtype)
-        return self._grid.to_modes(velocity.to(self._grid.dtype) - mean[:, None, None, None])
+        return self._grid.to_modes(velocity.to(self._grid.dtype))
 
 
 class Source:
@@ -165,8 +164,7 @@ class ReconstructionRun:
         time, particles, began = float(self.source.times[frame]), self.source.particles(frame), perf_counter()
         modes = self.methods[0].of(particles, time)
         row = {"time": time, "seconds": perf_counter() - began}
-        mean = as_numpy(mean_over_ranks(comm, particles.velocity))
-        made = Quantities(modes, mean, self.transfer, self.viscosity, self.grid, self.settings.fields, self.source.unit)
+        made = Quantities(modes, self.transfer, self.viscosity, self.grid, self.settings.fields, self.source.unit)
         segments.fields["reconstructed"].append(time, self.target.decomposition.start, made.on(self.target))
         if self.settings.particles:
             place = as_numpy(particles.position) * self.source.unit - self.source.corner
@@ -175,9 +173,9 @@ class ReconstructionRun:
             segments.trajectories["tracks"].append(frame, time, 0 if comm.rank == 0 else self.source.most, rows)
         if len(self.methods) > 1:
             known, apart = split(particles, self.settings.holdout)
-            row["validation_error"] = validation_error(self.solver, self.methods[1].of(known, time), known, apart)
+            row["validation_error"] = validation_error(self.solver, self.methods[1].of(known, time), apart)
         if self.source.truth is not None and frame in self.source.truth.field_frames:
-            self.of_fields.append({"time": time, **errors_of(modes, mean, self.tracers, self.grid, self.source.truth,
+            self.of_fields.append({"time": time, **errors_of(modes, self.tracers, self.grid, self.source.truth,
                                                              frame)})
         self.errors.append(row)
 
@@ -279,22 +277,23 @@ def _maker(settings: Reconstruction, tracers: Tracers, viscosity: float, kernel:
 
 
 class Quantities:
-    """The quantities of one frame, made from the modes of the velocity minus its mean.
+    """The quantities of one frame, made from the modes of the velocity.
 
     Parameters
     ----------
-    modes : (3, kz, ky, kx) on `grid`. mean : mean velocity (3,). transfer : G of the filter of the velocity.
+    modes : (3, kz, ky, kx) on `grid`. transfer : G of the filter of the velocity.
     viscosity : nu. wanted : quantities to compute, names in RECONSTRUCTED. unit : as in `Source`.
     """
 
     @torch.no_grad()
-    def __init__(self, modes: Tensor, mean: np.ndarray, transfer: Tensor, viscosity: float, grid: FourierGrid,
+    def __init__(self, modes: Tensor, transfer: Tensor, viscosity: float, grid: FourierGrid,
                  wanted: tuple[str, ...], unit: float) -> None:
-        self.grid, self.wanted, self.unit, self.mean = grid, wanted, unit, mean
+        self.grid, self.wanted, self.unit = grid, wanted, unit
         self._modes = {"velocity": modes}
         if {"gradient", "vorticity", "q", "r"} & {*wanted}:
             self._modes["gradient"] = torch.cat([grid.gradient(component) for component in modes])
         if {"pressure", "acceleration"} & {*wanted}:
+            modes = grid.without_mean(modes)  # a mean velocity has no effect, but would add round-off errors
             whole = grid.squares(modes / transfer)
             self._modes["pressure"] = (transfer * grid.pressure_of(whole))[None]
             self._modes["acceleration"] = (
@@ -317,7 +316,7 @@ class Quantities:
         """Compute the wanted quantities; `values` evaluates modes as an array (components, ...)."""
         given = {name: values(modes) for name, modes in self._modes.items()}
         velocity = given["velocity"]
-        found = {"velocity": self.unit * (velocity + self.mean.reshape(3, *[1] * (velocity.ndim - 1)))}
+        found = {"velocity": self.unit * velocity}
         if "gradient" in given:
             a = given["gradient"].reshape(3, 3, *velocity.shape[1:])
             square = np.einsum("ij...,jk...->ik...", a, a)
@@ -330,9 +329,8 @@ class Quantities:
         return {name: found[name] for name in self.wanted}
 
 
-def errors_of(modes: Tensor, mean: np.ndarray, tracers: Tracers, grid: FourierGrid, truth: GroundTruth,
-              frame: int) -> dict[str, float]:
-    """Return normalised L2 errors at a frame: `velocity_error` and `gradient_error` of the filtered velocity.
+def errors_of(modes: Tensor, tracers: Tracers, grid: FourierGrid, truth: GroundTruth, frame: int) -> dict[str, float]:
+    """Return the `relative_error` at a frame: `velocity_error` and `gradient_error` of the filtered velocity.
 
     The ground truth must hold a field at this frame. Collective.
     """
@@ -340,8 +338,12 @@ def errors_of(modes: Tensor, mean: np.ndarray, tracers: Tracers, grid: FourierGr
     target = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
     exact = truth.planes(truth.fields, truth.field_frames.index(frame), "velocity", slab)
     given = modes if tracers.filtered else modes * grid.filter_transfer(tracers.filter_width)
-    own = target.backward(regrid(grid.spectral, target, as_numpy(given.resolve_conj()))) + mean[:, None, None, None]
+    own = target.backward(regrid(grid.spectral, target, as_numpy(given.resolve_conj())))
     slopes = [np.concatenate([target.backward(target.gradient(component)) for component in target.forward(field)])
               for field in (own, exact)]
-    return {f"{name}_error": relative_error(slab.comm, torch.from_numpy(made - true), torch.from_numpy(true))
+
+    def rows(planes: np.ndarray) -> Tensor:
+        return torch.from_numpy(planes.reshape(len(planes), -1).T)
+
+    return {f"{name}_error": relative_error(slab.comm, rows(made - true), fluctuations(slab.comm, rows(true)))
             for name, (made, true) in {"velocity": (own, exact), "gradient": slopes}.items()}

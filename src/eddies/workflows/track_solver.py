@@ -14,7 +14,7 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.exchanges import mean_over_ranks, relative_error
+from eddies.particles.exchanges import fluctuations, relative_error
 from eddies.particles.flow_units import ReferenceScales, resolved_wavenumber
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.remembered_velocity import RememberedVelocity
@@ -38,7 +38,7 @@ class LeastSquaresMethod:
 
     @torch.no_grad()
     def of(self, particles: ParticleSet, time: float) -> Tensor:
-        self._near = self._solver.of(particles, near=self._near).velocity
+        self._near = self._solver.of(particles, near=self._near).modes
         return self._near
 
     def state_dict(self) -> dict[str, Any]:
@@ -76,7 +76,7 @@ def best_solver(particles: ParticleSet, make: Callable[[float], ResolvedVelocity
     for weight in WEIGHTS.tolist():
         solver = make(weight)
         with torch.no_grad():
-            errors[weight] = validation_error(solver, solver.of(known).velocity, known, held_out)
+            errors[weight] = validation_error(solver, solver.of(known).modes, held_out)
         if errors[weight] > RISE * min(errors.values()):
             break
     best = min(errors, key=errors.__getitem__)
@@ -91,15 +91,14 @@ def split(particles: ParticleSet, share: float) -> tuple[ParticleSet, ParticleSe
     return known, held
 
 
-def validation_error(solver: ResolvedVelocity, modes: Tensor, known: ParticleSet, held_out: ParticleSet) -> float:
-    """Return the normalised L2 error of modes at the particles that were left out; NaN if there are none. Collective.
+def validation_error(solver: ResolvedVelocity, modes: Tensor, held_out: ParticleSet) -> float:
+    """Return the `relative_error` of a velocity, given by its modes, at the particles that were left out.
 
-    The modes are those of the velocity minus the mean velocity of the `known` particles.
+    The result is NaN if there are none. Collective.
     """
     comm = solver.grid.decomposition.comm
-    wanted = held_out.velocity - mean_over_ranks(comm, known.velocity)
-    missed = solver.grid.at(modes, solver.grid.points(held_out.position)) - wanted
-    return relative_error(comm, missed, wanted)
+    missed = solver.grid.at(modes, solver.grid.points(held_out.position)) - held_out.velocity
+    return relative_error(comm, missed, fluctuations(comm, held_out.velocity))
 
 
 def slabs_for(comm: Comm, tracers: Tracers, resolved: Tracers, filter_width: float,

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from eddies.analysis.errors import fluctuations
 from eddies.analysis.isotropic_turbulence import dissipation_constant
 from eddies.flow.statistics import component_energies, energy_spectrum, gradient_moments, turbulence_scales
 from eddies.io.fields import FieldWriter
@@ -23,7 +24,6 @@ from eddies.parallel.migration import IdOrder, id_block, migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
-from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.flow_units import measured_scales
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.particle_set import ParticleSet, as_numpy
@@ -108,7 +108,7 @@ def _sections_of(settings: Tracks, learned: bool) -> dict[str, Flow | Tracers]:
         raise SceneError(f"{settings.file}: only {present} of {tracks.about['in_file']} tracks are in {where}, but a "
                          f"model needs {LEAST_TRACKS}; give another part of the file")
     count = present if learned else max(count_for(tracks.spacing), LEAST_TRACKS)
-    speed = float(np.sqrt(np.mean(tracks.columns["velocity"]**2)))
+    speed = float(np.sqrt(np.mean(fluctuations(tracks.columns["velocity"])**2)))
     turnover = INTEGRAL_SCALE * BOX_LENGTH / speed if speed > 0 else math.inf
     width = None if settings.filter_width is None else settings.filter_width / tracks.unit
     tracers = Tracers(count=count, filtered=settings.filtered or learned, frame_interval=float(tracks.times[1]),
@@ -146,7 +146,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         particles = particles_on(slab, tracks.frame(0))
         make = partial(solver_of, slab, found | {"spacing": resolved.spacing, "filter_width": width})
         solver, weight, error = best_solver(particles, make)
-        flow = FrameFlow(solver.grid, solver.of(particles).velocity, particles, filtered, tracers.filter_width)
+        flow = FrameFlow(solver.grid, solver.of(particles).modes, particles, filtered, tracers.filter_width)
         found = flow.scales(viscosity) | reference  # velocity_rms is that of the particles
     reference = found
     coarse = SpectralGrid(SlabDecomposition(comm, BOX_LENGTH, tracers.cells), cutoff=(tracers.cells - 1) // 2)
@@ -183,7 +183,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             if not stored:
                 continue
             grid, modes = flow.grid.spectral, as_numpy(flow.filtered)
-            planes = coarse.backward(regrid(grid, coarse, modes)) + flow.mean[:, None, None, None]
+            planes = coarse.backward(regrid(grid, coarse, modes))
             fields.append(time, coarse.decomposition.start, {"velocity": planes})
             row = flow.scales(viscosity) | {"time": time, "energy": flow.energy.sum()}
             skewness, flatness = gradient_moments(grid, modes)
@@ -213,16 +213,15 @@ class FrameFlow:
 
     Parameters
     ----------
-    grid, modes : modes (3, kz, ky, kx) of the velocity minus the mean velocity of the `particles`, and their grid.
+    grid, modes : modes (3, kz, ky, kx) of the velocity, and their grid. particles : the particles of the frame.
     filtered, filter_width : whether the particles follow the filtered velocity, and the width of the filter.
     """
 
     def __init__(self, grid: FourierGrid, modes: Tensor, particles: ParticleSet, filtered: bool,
                  filter_width: float) -> None:
         self.grid, comm, transfer = grid, grid.decomposition.comm, grid.filter_transfer(filter_width)
-        self.mean = as_numpy(mean_over_ranks(comm, particles.velocity))
         whole, self.filtered = (modes * (1 / transfer), modes) if filtered else (modes, modes * transfer)
-        among = grid.at(modes, grid.points(particles.position))
+        among = grid.at(grid.without_mean(modes), grid.points(particles.position))
         square, count = global_sum(comm, np.array([float(among.square().sum()), len(particles.id)]))
         share = square / count / (2 * energy_spectrum(grid.spectral, as_numpy(modes)).sum())
         self.energy, self.filtered_energy = (share * energy_spectrum(grid.spectral, as_numpy(each))
@@ -231,7 +230,7 @@ class FrameFlow:
     @torch.no_grad()
     def at(self, position: np.ndarray) -> np.ndarray:
         """Return the filtered velocity (n, 3) at positions (n, 3) on this rank; collective."""
-        return as_numpy(self.grid.at(self.filtered, self.grid.points(torch.from_numpy(position)))) + self.mean
+        return as_numpy(self.grid.at(self.filtered, self.grid.points(torch.from_numpy(position))))
 
     def scales(self, viscosity: float) -> dict[str, float]:
         """Return the scales of `turbulence_scales`, with the `dissipation_rate` eps = C_eps u'^3 / L. C_eps and

@@ -39,8 +39,11 @@ class Known:
         self.grid, self.modes, self.width = grid, modes, width
 
     def of(self, particles, time=None):
-        relative = particles.velocity - particles.velocity.mean(0)
-        return ResolvedFlow(self.grid, self.modes, self.grid.points(particles.position), relative, self.width)
+        points, mean = self.grid.points(particles.position), particles.velocity.new_zeros(3)
+        flow = ResolvedFlow(self.grid, mean, self.modes, points, particles.velocity, self.width)
+        # The condition of the least squares for the zeroth mode.
+        mean = flow.missing().mean(0)
+        return replace(flow, mean=mean, relative_velocity=particles.velocity - mean)
 
 
 def grid_on(cells, resolved):
@@ -207,13 +210,14 @@ def test_the_force_at_particles_that_resolve_their_velocity(comm):
 
 
 @one_rank
-def test_in_a_laminar_flow_energy_leaks_into_modes_that_it_lacks(comm):
-    """The filtered ABC flow, k = 3, at 16^3 random places. Undoing the filter amplifies what the solve leaks."""
+def test_in_a_laminar_flow_little_energy_leaks_into_modes_that_it_lacks(comm):
+    """The filtered ABC flow, k = 3, at 16^3 random places. Undoing the filter amplifies what the solve leaks. With the
+    mean over the particles in place of the zeroth mode the errors are 0.1 and 0.06."""
     z, y, x = 3 * np.indices((CELLS,) * 3) * (LENGTH / CELLS)
     modes = modes_of(np.stack([np.sin(z) + np.cos(y), np.sin(x) + np.cos(z), np.sin(y) + np.cos(x)]))
     position = np.random.default_rng(1).random((16**3, 3)) * LENGTH
     with_stress, without = errors_of_solves(comm, 28, modes, LENGTH / 8, position)
-    assert 0.02 < without < 0.08 and without < with_stress < 0.15
+    assert without < with_stress < 0.01
 
 
 @one_rank

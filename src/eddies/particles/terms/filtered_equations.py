@@ -37,8 +37,8 @@ class FilteredEquations(Term):
 
         d rho/dt = C_p (2 u'/d) (rho_0/c^2) (p - p before the sweeps).
 
-    So pressure spreads from neighbour to neighbour, sweep by sweep, and no sound has to be resolved. Forces, p and s
-    are taken relative to their means over all particles.
+    So pressure spreads from neighbour to neighbour, sweep by sweep, and no sound has to be resolved. p and s are taken
+    relative to their means over all particles: a constant in p has no force.
     """
 
     Settings = declared.FilteredEquations
@@ -68,7 +68,7 @@ class FilteredEquations(Term):
                   - settings.solenoidal * rate * first.diagonal(dim1=1, dim2=2).sum(1))
         before = (self.stiffness * (context.everywhere.own_density - scales.density_mean)).to(first)
         pressure = self._balanced(context, before, source)
-        force = context.without_mean(force - kriging.gradient(pressure))
+        force = force - kriging.gradient(pressure)
         change = settings.density * rate / self.stiffness * (pressure - before)
         return Rates(acceleration=force.to(velocity), density_rate=change.to(velocity))
 

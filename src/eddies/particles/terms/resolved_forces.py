@@ -108,8 +108,8 @@ class Damping(Term):
 class Relaxation(Term):
     """The relaxation -C (v - u) of each particle's velocity v to the resolved velocity u.
 
-    The mean of v - u over the particles is subtracted, so the momentum is conserved. C is a learned factor times
-    2 u_rms/d, where u_rms is the present rms of a component of u.
+    The mean of v - u over the particles is zero, because the least squares find u. C is a learned factor times
+    2 u_rms/d, where u_rms is the present rms of a component of u about its mean.
     """
 
     Settings = declared.Relaxation
@@ -125,7 +125,7 @@ class Relaxation(Term):
 
     def forward(self, context: Context) -> Rates:
         flow = context.resolved
-        missing = context.without_mean(flow.missing())
+        missing = flow.missing()
         rate = (2 * flow.rms / flow.filter_width).to(missing) * self.factor.to(missing)
         return Rates(acceleration=-rate * missing)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -14,6 +15,7 @@ from eddies.clock import ProgressLine
 from eddies.learning.force_training import FieldLater, ForceTrainer, LossWeights, TrainingFrame
 from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow
 from eddies.particles.dynamics import ParticleDynamics
+from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.model import LagrangianModel
 from eddies.particles.particle_field import grid_points
@@ -106,6 +108,11 @@ class TrainingData:
         later = {name: torch.from_numpy(columns[f"{name}_later"]).to(device).movedim(1, 0).contiguous()
                  for name in ("position", "velocity", "density") if f"{name}_later" in columns}
         particles = particles_for(self.model, columns, device)
+        # In the frame that moves with the mean velocity, particles stay near their slab.
+        mean = mean_over_ranks(self.truth.decomposition.comm, particles.velocity)
+        elapsed = torch.from_numpy(np.diff(self.truth.times[start:start + self.longest + 1]).cumsum()).to(mean)
+        particles = replace(particles, velocity=particles.velocity - mean)
+        later |= {"position": later["position"] - elapsed[:, None, None] * mean, "velocity": later["velocity"] - mean}
         # Stored positions are wrapped into the box; `position` continues from the first frame.
         position = particles.position + PeriodicBox(BOX_LENGTH).displacement(later["position"], particles.position)
         moments = [particles, *(ParticleSet(particles.id, *moved) for moved in zip(position, later["velocity"]))]
@@ -161,14 +168,16 @@ def load_frame(truth: GroundTruth, index: int, model: LagrangianModel, dtype: to
 
 def _field_after(truth: GroundTruth, frame: int, dtype: torch.dtype) -> FieldLater:
     """Return the filtered field one frame after `frame`, with the positions and velocities of the particles at that
-    time."""
+    time. Both velocities are relative to the mean over the particles."""
     slab, device = truth.decomposition, truth.device
     columns = truth.window(frame, 1)  # rows as in `particles_with_rates`
     position, later = (torch.from_numpy(columns[name]) for name in ("position", "position_later"))
     # Stored positions are wrapped into the box; `moved` continues from the positions of the frame.
     moved = position + PeriodicBox(slab.length).displacement(later[:, 0], position)
     points = grid_points(slab, truth.fields.cells)
-    field = torch.from_numpy(truth.field_at(frame + 1, points))
-    return FieldLater(moved.to(device), torch.from_numpy(columns["velocity_later"][:, 0]).to(device, dtype),
+    field, velocity = (torch.from_numpy(values)
+                       for values in (truth.field_at(frame + 1, points), columns["velocity_later"][:, 0]))
+    mean = mean_over_ranks(slab.comm, velocity)
+    return FieldLater(moved.to(device), (velocity - mean).to(device, dtype),
                       float(truth.times[frame + 1] - truth.times[frame - 1]), points.to(device),
-                      field.to(device, dtype))
+                      (field - mean).to(device, dtype))

@@ -9,6 +9,7 @@ from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
+import torch
 
 from eddies.clock import WARM_UP_STEPS, Clock, ProgressLine
 from eddies.io.checkpoint import Checkpoint, Guard
@@ -104,7 +105,7 @@ class Course:
         return complaint
 
     def _store(self, at: float) -> None:
-        """Store the frame at the time `at`, and keep the mean kinetic energy <v.v>/2 of its particles."""
+        """Store the frame at the time `at`, and keep the kinetic energy of its particles for the progress line."""
         layout, own = self.segments.layout, self.segments.layout.trajectories["model"]
         # The first step uses the forces of the first frame. Later frames evaluate forces for storing only; this time
         # counts as storing.
@@ -118,8 +119,10 @@ class Course:
             self.segments.trajectories["model"].append(self.steps, at, order.start, {
                 name: order.apply(columns[name]) for name in own.columns})
             self.times.append(at)
-        energy = 0.5 * float(particles.velocity.double().square().sum())
-        self.energy = float(global_sum(self.comm, energy)) / own.total
+        velocity = particles.velocity.double()
+        first, second = velocity.sum(0), velocity.square().sum(0)
+        mean, square = global_sum(self.comm, as_numpy(torch.stack([first, second]))) / own.total
+        self.energy = float(np.sum(square - mean**2)) / 2  # without the mean velocity
 
     def _describe(self) -> str:
         return f"t {self.clock.time:.3f}  energy {self.energy:.4f}{self.method.status()}"

@@ -244,7 +244,7 @@ def state_of_particles(truth: GroundTruth, fluid: Fluid, filter_passed: float, f
     solver, grid = ResolvedVelocity.on_slabs(truth.decomposition, truth.scales), fluid.grid
     resolved = solver.of(ParticleSet.from_numpy(truth.particles(frame)))
     modes = resolved.velocity if filter_passed else resolved.unfiltered
-    velocity = regrid(resolved.grid.spectral, grid, as_numpy(modes))
+    velocity = regrid(resolved.grid.spectral, grid, as_numpy(resolved.grid.with_mean(modes, resolved.mean)))
     if not fluid.compressible:
         return velocity
     return np.concatenate([velocity, balanced_density(grid, velocity, fluid.sound_speed)[None]])

@@ -53,7 +53,10 @@ class ReconstructedFields:
         return self._once("gradients", frame, made)
 
     def plane(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the velocity (3, y, x) and the magnitude of the vorticity (y, x) on the grid in the plane z = pi."""
+        """Return the velocity (3, y, x) and the magnitude of the vorticity (y, x) on the grid in the plane z = pi.
+
+        The velocity is relative to the mean over the particles.
+        """
         axis = torch.arange(self.slab.planes, dtype=torch.float64) * self.slab.spacing
         y, x = torch.meshgrid(axis, axis, indexing="ij")
         middle = torch.full_like(x, self.slab.planes // 2 * self.slab.spacing)
@@ -61,6 +64,7 @@ class ReconstructedFields:
         velocity, gradient = self.form.at(self._field(frame), points)
         antisymmetric = gradient - gradient.transpose(1, 2)  # its norm is sqrt(2) times the vorticity
         vorticity = antisymmetric.square().sum((1, 2)).div(2).sqrt()
+        velocity = velocity - torch.from_numpy(self.particles.read(frame, "velocity").mean(axis=0)).to(velocity)
         return self._by_component(velocity, 2), as_numpy(vorticity).reshape([self.slab.planes] * 2)
 
     def forget(self) -> None:

@@ -13,6 +13,7 @@ from eddies.io.checkpoint import Checkpoint
 from eddies.parallel.broadcast import first_complaint
 from eddies.parallel.halo import HaloError
 from eddies.particles.dynamics import ParticleDynamics
+from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.faults import Limits, find_fault
 from eddies.particles.feature_range import FeatureRange, pair_features
 from eddies.particles.flow_units import allowed_step
@@ -27,9 +28,9 @@ from eddies.workflows.rollout.saved_particles import particle_state, restored_pa
 
 log = logging.getLogger("eddies")
 
-# A state is faulty if the speed of a particle exceeds RUNAWAY_SPEED times the rms velocity of the truth. It is also
-# faulty if the density of a particle deviates from the mean density by more than this mean and by more than
-# RUNAWAY_DENSITY times the true rms deviation.
+# A state is faulty if the speed of a particle, relative to the mean velocity at the start, exceeds RUNAWAY_SPEED times
+# the rms velocity of the truth. It is also faulty if the density of a particle deviates from the mean density by more
+# than this mean and by more than RUNAWAY_DENSITY times the true rms deviation.
 RUNAWAY_SPEED, RUNAWAY_DENSITY = 30.0, 300.0
 # Columns of the table on the solves for the resolved velocity; see `ParticleRun.series`.
 SOLVES = "solves", "iterations", "most_iterations", "residual", "not_converged"
@@ -59,7 +60,8 @@ class ParticleRun:
         self._before: Moment | None = None
         if model.integrates_density and scales.density is not None:
             deviation = max(RUNAWAY_DENSITY * scales.density, scales.density_mean)
-        self.limits = Limits(RUNAWAY_SPEED * scales.velocity, scales.density_mean, deviation)
+        frame = mean_over_ranks(self.comm, self.particles.velocity)
+        self.limits = Limits(RUNAWAY_SPEED * scales.velocity, frame, scales.density_mean, deviation)
         self._shares_outside: list[float] = []
         self._solves: dict[str, list[float]] = {name: [] for name in SOLVES}
 

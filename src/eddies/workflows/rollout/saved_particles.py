@@ -68,7 +68,8 @@ def particle_state(particles: ParticleSet, integrator: Integrator) -> dict[str, 
         modes = saved_modes(dynamics.resolution.grid.spectral, as_numpy(values["modes"]))
         solves = [(int(iterations), float(residual), bool(converged))
                   for iterations, residual, converged in dynamics.resolution.solves]
-        state |= {"closure": {"times": values["times"].tolist(), "speed": float(values["speed"]), "solves": solves},
+        state |= {"closure": {"times": values["times"].tolist(), "means": values["means"].tolist(),
+                              "speed": float(values["speed"]), "solves": solves},
                   "modes": modes}
     return state
 
@@ -85,6 +86,7 @@ def restored_particles(saved: Checkpoint, integrator: Integrator, device: torch.
         closure = saved["closure"]
         modes = torch.from_numpy(restored_modes(dynamics.resolution.grid.spectral, saved, 6))
         state |= {"modes": modes, "times": torch.tensor(closure["times"], dtype=torch.float64),
+                  "means": torch.tensor(closure["means"], dtype=torch.float64).reshape(-1, 3),
                   "speed": torch.tensor(closure["speed"], dtype=torch.float64)}
         dynamics.resolution.solves = [tuple(solve) for solve in closure["solves"]]
     dynamics.load_state_dict(state)
