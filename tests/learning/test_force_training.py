@@ -197,7 +197,7 @@ def test_a_model_without_networks_reaches_the_least_squares_fit(comm):
     trainer = trainer_of(comm, "resolved", LossWeights(), batch=10**6)
     assert not trainer.model.networks and trainer.frames[0].dynamics.neighborhood is None
     # Nearly all of the velocity is resolved, so the factors that fit are large.
-    losses = [row["loss"] for row in fitted(trainer, 400, (1.0, 1e-2))]
+    losses = [row["loss"] for row in fitted(trainer, 600, (1.0, 1e-2))]
     frame = trainer.frames[0]
     slopes = torch.cat([frame.kept[name].slopes["acceleration"] for name in frame.kept if frame.kept[name].slopes])
     slopes = slopes.flatten(1)

@@ -19,7 +19,8 @@ def test_measured_scales_are_root_mean_squares_over_all_ranks(comm):
         return pytest.approx(np.sqrt(np.mean(values**2)), rel=1e-12)
 
     assert measured_scales(comm, *frames, 0.1) == {
-        "velocity_rms": rms(velocity[0] - velocity[0].mean(axis=0)), "acceleration_rms": rms((velocity[1] - velocity[0]) / 0.1),
+        "velocity_rms": rms(velocity[0] - velocity[0].mean(axis=0)),
+        "acceleration_rms": rms((velocity[1] - velocity[0]) / 0.1),
         "density_rms": rms(density[0] - 1), "density_rate_rms": rms((density[1] - density[0]) / 0.1)}
 
 
