@@ -6,7 +6,7 @@ import torch
 
 from eddies.flow.tracers import release
 from eddies.learning.optimization import shared_values
-from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow, mean_losses
+from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow, energy_units
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_max
 from eddies.parallel.slab import SlabDecomposition
@@ -35,7 +35,8 @@ def solving(resolved, iterations):
 
 
 def window_of(slab, with_density):
-    """Particles in a smooth flow that changes slowly, with true velocities and energies."""
+    """Particles in a smooth flow that changes slowly, with true velocities, and energies that decay by a tenth in each
+    frame. Particles without acceleration keep their energies."""
     columns = release(slab, 3, PER_SIDE**3, "random")
     x, y, z = columns["position"].T
 
@@ -55,8 +56,8 @@ def window_of(slab, with_density):
         del columns["density"], true["density"]
     particles = ParticleSet(**columns)
     start = resolution(slab).band_energies(particles)
-    energies = torch.stack([start * 0.9**frame for frame in range(FRAMES + 1)])
-    return TrainingWindow(particles, true["velocity"], true.get("density"), energies)
+    energies = torch.stack([start * 0.9**frame for frame in range(1, FRAMES + 1)])
+    return TrainingWindow(particles, true["velocity"], true.get("density"), energies, start.expand_as(energies))
 
 
 def trainer_of(comm, preset="resolved + pairs", integrator="verlet", steps=1, iterations=ITERATIONS):
@@ -158,22 +159,21 @@ def test_memory_does_not_grow_with_the_steps(comm):
 @pytest.mark.mpi(2)
 def test_without_a_weight_windows_need_no_energies(comm):
     with_energies, _ = trainer_of(comm)
-    windows = [replace(window, energies=None) for window in with_energies.windows]
+    windows = [replace(window, energies=None, unforced=None) for window in with_energies.windows]
     trainer = RolloutTrainer(comm, with_energies.integrator, windows, INTERVAL, 1, 0.0, None, 5)
     shares, expected = (each.loss_shares(each.windows[0], 2) for each in (trainer, with_energies))
     assert shares == {"rollout_loss": expected["rollout_loss"]}
 
 
 @pytest.mark.mpi(1)
-def test_the_energies_count_in_units_of_their_mean_loss(comm):
-    """All bands lose a tenth per frame, at least a tenth of the fastest; these particles keep their energies."""
+def test_the_energies_count_in_units_of_the_error_without_acceleration(comm):
     window = (trainer := trainer_of(comm)[0]).windows[0]
-    expected = ((1 - 0.9**2) / (0.9**2 * 2 * np.log(1 / 0.9))) ** 2
-    assert float(trainer._energy_share(window, 1, window.particles)) == pytest.approx(expected, rel=1e-9)
-    steady = replace(window, energies=torch.tensor([[1.0, 1.0], [1.0, 0.5], [1.0, 0.25]]))
-    assert torch.allclose(mean_losses([steady]), torch.tensor([0.1, 1.0]) * np.log(2))
-    growing = replace(window, energies=torch.tensor([[1.0, 1.0], [1.0, 2.0], [1.0, 4.0]]))
-    assert torch.allclose(mean_losses([steady, growing], stationary=True), torch.tensor([0.1, 1.0]) * np.log(2))
+    assert float(trainer._energy_share(window, 1, window.particles)) == pytest.approx(1, rel=1e-9)
+    # Bands by columns. The error of the first is below a tenth of that of the second in the first frame.
+    one, other = (replace(window, energies=torch.ones(2, 2), unforced=torch.tensor(unforced))
+                  for unforced in ([[1.0, 2.0], [1.5, 1.0]], [[1.01, 1.0], [1.5, 3.0]]))
+    root = 0.5**0.5
+    assert torch.allclose(energy_units([one, other]), torch.tensor([[0.1 * root, root], [0.5, 2 * root]]))
 
 
 @pytest.mark.mpi(1)

@@ -47,7 +47,7 @@ def test_a_model_that_is_the_stationary_flow_but_for_a_factor():
     run, columns = rollout()
     shown = section(run, stationary())
     value = {metric.key: metric.value for metric in shown.metrics}
-    energy = 0.5 * np.mean(np.sum(columns["velocity"] ** 2, axis=1))
+    energy = 0.5 * columns["velocity"].var(axis=0).sum()
     # The second half, three turnovers, are three blocks: with the factors 1 and 1.2, twice 1.1, three times 1.1.
     found = value["energy"]
     blocks = np.array([(1 + 1.2**2) / 2, 1.1**2, 1.1**2])
@@ -75,7 +75,7 @@ def test_frames_after_the_first_broken_one_do_not_count():
     """The averages are those of the frames 1 and 2."""
     run, columns = rollout(np.array([1.0, 1.2, 1.2, np.nan, 1.2]))
     value = {metric.key: metric.value for metric in section(run, stationary()).metrics}
-    assert value["energy"]["model"] == pytest.approx(1.2**2 * 0.5 * np.mean(np.sum(columns["velocity"] ** 2, axis=1)))
+    assert value["energy"]["model"] == pytest.approx(1.2**2 * 0.5 * columns["velocity"].var(axis=0).sum())
     assert value["spectrum_error"] == {"model": pytest.approx(2 * np.log(1.2)), "standard error": None}
 
 

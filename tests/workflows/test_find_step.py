@@ -47,12 +47,13 @@ def searched(scene, method="none", **keys):
 
 
 def sizes_and_errors(comm, scene, directory, turnovers, slope, sizes=None):
-    """Steps of the ladder, and the relative error of each that FirstOrder has, with the rms of the velocity."""
+    """Steps of the ladder, and the relative error of each that FirstOrder has, with the rms fluctuation of the
+    velocity."""
     with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
         span = turnovers * read_attributes(file, "reference")["eddy_turnover_time"]
     frames = round(span / scene.tracers.frame_interval)
     first, last = velocities(comm, directory, scene.tracers.field_every, scene.tracers.field_every + frames)
-    rms = np.sqrt(np.mean(last**2))
+    rms = np.sqrt(np.mean((last - last.mean(axis=0)) ** 2))
     sizes = span / 2.0 ** np.arange(20) if sizes is None else sizes
     return sizes, [np.sqrt(np.mean((first + slope * size - last) ** 2)) / rms for size in sizes], rms
 

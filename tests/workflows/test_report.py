@@ -167,7 +167,7 @@ def test_numbers_of_a_known_rollout(comm, tmp_path):
     assert rollout["early_velocity_error"] == rollout["velocity_error"]
     with h5py.File(tmp_path / "ground_truth.h5") as file:
         velocity = file["particles/tracers/velocity/value"][6:12]
-        apart, energy = ((velocity[0] - velocity[-1]) ** 2).mean(), (velocity[:].astype(float) ** 2).mean(axis=(1, 2))
+        apart, energy = ((velocity[0] - velocity[-1]) ** 2).mean(), velocity.astype(float).var(axis=1).mean(axis=1)
     assert rollout["early_velocity_error_no_force"] == pytest.approx((apart / energy[-1]) ** 0.5, rel=1e-5)
     assert rollout["energy_ratio_no_force"] == pytest.approx(energy[0] / energy[-1], rel=1e-5)
     assert rollout["filter_wavenumber"] == pytest.approx(4)

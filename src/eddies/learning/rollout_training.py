@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,7 +21,7 @@ from eddies.particles.integrators import Integrator
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
 
-# Lower bound of the typical energy change of a band (see `mean_losses`), as a share of the largest change of any band.
+# Lower bound of the unit of a band's energy error (see `energy_units`), as a share of the largest unit of any band.
 SLOWEST = 0.1
 
 
@@ -33,14 +34,16 @@ class TrainingWindow:
     particles : the particles at the start.
     velocity, density : true values (frames, n, 3) and (frames, n) at the end of frame intervals 1, 2, ...; rows are as
         in `particles`. The density may be None.
-    energies : true kinetic energy (frames + 1, bands) in bands of wavenumbers, at the start and at the end of each
-        frame interval; None without the energy loss.
+    energies : true kinetic energy (frames, bands) in bands of wavenumbers at the end of each frame interval; None
+        without the energy loss.
+    unforced : the same for particles that keep their velocity from the start.
     """
 
     particles: ParticleSet
     velocity: Tensor
     density: Tensor | None
     energies: Tensor | None = None
+    unforced: Tensor | None = None
 
 
 class RolloutTrainer:
@@ -52,9 +55,9 @@ class RolloutTrainer:
     rate is learned has a loss of the same form.
 
     The energy loss is the squared error of the kinetic energy in a band of wavenumbers, averaged over the bands. The
-    error is in units of the energy that the band loses on average from the start to the frame. This loss is needed
-    because noise in the inputs makes fitted forces too weak. Such forces take too much energy from some scales and too
-    little from others, and the error of the velocity hardly shows this.
+    error of a band in a frame is in units of the error of particles without acceleration. So this loss, too, is about 1
+    without acceleration. It is needed because noise in the inputs makes fitted forces too weak. Such forces take too
+    much energy from some scales and too little from others, and the error of the velocity hardly shows this.
 
     The gradient is that of the whole rollout. It goes through the forces of all steps, the distances of neighbours, the
     halo, and the grid of the resolved velocity. The backward pass computes each step again, so that memory holds the
@@ -68,18 +71,16 @@ class RolloutTrainer:
     energy_weight : weight of the energy loss; if it is zero, windows need no energies.
     resolution : computes the band energies of particles; unused if `energy_weight` is zero.
     seed : seed of the random choice of windows.
-    stationary : whether the flow is forced, so that its bands lose no energy on average. The unit of the energy loss is
-        then the rms change of a band's energy.
     """
 
     def __init__(self, comm: Comm, integrator: Integrator, windows: Sequence[TrainingWindow], frame_interval: float,
                  steps_per_frame: int, energy_weight: float, resolution: ResolvedVelocity | None,
-                 seed: int, stationary: bool = False) -> None:
+                 seed: int) -> None:
         self.comm, self.integrator, self.windows = comm, integrator, windows
         self.steps_per_frame, self.time_step = steps_per_frame, frame_interval / steps_per_frame
         self.energy_weight, self.resolution, self.seed = energy_weight, resolution, seed
         self.total = int(global_sum(comm, len(windows[0].particles)))
-        self.losses = mean_losses(windows, stationary) if energy_weight > 0 else None
+        self.units = energy_units(windows) if energy_weight > 0 else None
 
     def step(self, optimizer: Adam, step: int, horizon: int) -> dict[str, float]:
         """Take an optimiser step on the first `horizon` frames of a random window.
@@ -95,18 +96,18 @@ class RolloutTrainer:
         return {"loss": sum(values.values()), **values, "gradient_norm": norm}
 
     def loss_shares(self, window: TrainingWindow, horizon: int) -> dict[str, Tensor]:
-        """Return this rank's shares of "rollout_loss" and, if it is used, "energy_loss"; collective.
+        """Return this rank's shares of "rollout_loss", that of the velocity, and, if they are used, "density_loss" and
+        "energy_loss"; collective.
 
         A loss is the mean over the first `horizon` frames of the window. The energy loss includes its weight. The sum
         of the shares of all ranks is the loss.
         """
-        shares: dict[str, list[Tensor]] = {"rollout_loss": []}
+        shares: dict[str, list[Tensor]] = defaultdict(list)
         for reached, particles in self._frames(window.particles, horizon):
-            shares["rollout_loss"] += [mean_square_share(error, root_mean_square(self.comm, change), self.total)
-                                       for error, change in self._errors(window, reached, particles)]
+            for name, error, change in self._errors(window, reached, particles):
+                shares[name].append(mean_square_share(error, root_mean_square(self.comm, change), self.total))
             if self.energy_weight > 0:
-                shares.setdefault("energy_loss", []).append(
-                    self.energy_weight * self._energy_share(window, reached, particles))
+                shares["energy_loss"].append(self.energy_weight * self._energy_share(window, reached, particles))
         return {name: sum(parts) / horizon for name, parts in shares.items()}
 
     @torch.no_grad()
@@ -135,8 +136,8 @@ class RolloutTrainer:
             return energies
 
         energies = _recomputed(energies_of, particles.position, particles.velocity)
-        true = window.energies[frame + 1]
-        return ((energies - true) / (true * self.losses * (frame + 1))).square().mean() / self.comm.size
+        true = window.energies[frame]
+        return ((energies - true) / (true * self.units[frame])).square().mean() / self.comm.size
 
     def _frames(self, particles: ParticleSet, horizon: int) -> Iterator[tuple[int, ParticleSet]]:
         """Yield the number, from 0 on, and the particles of each frame that the rollout reaches."""
@@ -173,32 +174,31 @@ class RolloutTrainer:
         return moved, dict(zip(after[1], columns[len(after[0]):]))
 
     def _errors(self, window: TrainingWindow, frame: int,
-                particles: ParticleSet) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield the error (n, 3) of the velocity, and the true change (n, 3) of the velocity since the window's start.
+                particles: ParticleSet) -> Iterator[tuple[str, Tensor, Tensor]]:
+        """Yield the name of the loss of the velocity, its error (n, 3) and its true change (n, 3) since the start.
 
-        If the model learns the rate of the density, also yield the error (n,) and the true change (n,) of the density.
+        If the model learns the rate of the density, also yield the same of the density: a name, (n,) and (n,).
         """
         true = window.velocity[frame]
-        yield particles.velocity - true, true - window.particles.velocity
+        yield "rollout_loss", particles.velocity - true, true - window.particles.velocity
         if self.integrator.dynamics.model.learns_density:
             true = window.density[frame]
-            yield particles.density - true, true - window.particles.density
+            yield "density_loss", particles.density - true, true - window.particles.density
 
 
 # The wrapper of `checkpoint` loads torch's compiler, which takes two seconds.
 UNWRAPPED = getattr(checkpoint, "__wrapped__", checkpoint)
 
 
-def mean_losses(windows: Sequence[TrainingWindow], stationary: bool = False) -> Tensor:
-    """Return the typical change of ln(energy) in a frame interval for each band of wavenumbers, (bands,).
+def energy_units(windows: Sequence[TrainingWindow]) -> Tensor:
+    """Return the relative error of the band energies of particles without acceleration: (frames, bands).
 
-    The change is the absolute value of the mean over windows, or the rms over windows if `stationary`. Changes below
-    SLOWEST times the largest change of any band are raised to this bound.
+    It is the rms over windows. In each frame, errors below SLOWEST times the largest of any band are raised to this
+    bound.
     """
-    changes = torch.stack([window.energies[-1] / window.energies[0] for window in windows]).log()
-    change = changes.square().mean(0).sqrt() if stationary else changes.mean(0)
-    losses = (change / (len(windows[0].energies) - 1)).abs()
-    return losses.clamp_min(SLOWEST * float(losses.max()))
+    errors = torch.stack([window.unforced / window.energies - 1 for window in windows])
+    units = errors.square().mean(0).sqrt()
+    return torch.maximum(units, SLOWEST * units.amax(1, keepdim=True))
 
 
 def _recomputed(function: Callable[..., Any], *columns: Tensor) -> Any:

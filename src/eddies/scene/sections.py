@@ -429,7 +429,7 @@ class Horizons(Section):
                                      above=0)
     integrator: str = choice("time stepping method of the simulation", *SCHEMES, default="verlet")
     learning_rate: float = number("learning rate at the start, for each number of frames", default=1e-3, above=0)
-    energy_weight: float = number("weight of the energies in wavenumber bands in the loss", default=0.1, at_least=0)
+    energy_weight: float = number("weight of the energies in wavenumber bands in the loss", default=10.0, at_least=0)
 
     @property
     def scheme(self) -> Scheme:

@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from eddies.analysis.lagrangian import evenly
 from eddies.clock import ProgressLine
@@ -96,8 +97,7 @@ class TrainingData:
         windows = [self._window(start, resolution) for start in starts]
         substeps = round(interval / (settings.time_step or interval))
         trainer = RolloutTrainer(slab.comm, INTEGRATORS[settings.integrator](dynamics), windows, interval,
-                                 substeps, settings.energy_weight, resolution, self.definition.seed,
-                                 stationary=self.truth.forcing is not None)
+                                 substeps, settings.energy_weight, resolution, self.definition.seed)
         return trainer, self._window(self.last - self.longest, resolution)
 
     def _frame(self, index: int) -> TrainingFrame:
@@ -113,14 +113,21 @@ class TrainingData:
         elapsed = torch.from_numpy(np.diff(self.truth.times[start:start + self.longest + 1]).cumsum()).to(mean)
         particles = replace(particles, velocity=particles.velocity - mean)
         later |= {"position": later["position"] - elapsed[:, None, None] * mean, "velocity": later["velocity"] - mean}
-        # Stored positions are wrapped into the box; `position` continues from the first frame.
-        position = particles.position + PeriodicBox(BOX_LENGTH).displacement(later["position"], particles.position)
-        moments = [particles, *(ParticleSet(particles.id, *moved) for moved in zip(position, later["velocity"]))]
-        energies = None
+        true, unforced = None, None
         if self.settings.horizons.energy_weight > 0:
-            with torch.no_grad():
-                energies = torch.stack([resolution.band_energies(moment) for moment in moments])
-        return TrainingWindow(particles, later["velocity"], later.get("density"), energies)
+            # Stored positions are wrapped into the box; `position` continues from the first frame.
+            position = particles.position + PeriodicBox(BOX_LENGTH).displacement(later["position"], particles.position)
+            straight = particles.position + elapsed[:, None, None] * particles.velocity
+            true, unforced = (self._energies(resolution, particles, *moments) for moments in (
+                (position, later["velocity"]), (straight, particles.velocity.expand_as(straight))))
+        return TrainingWindow(particles, later["velocity"], later.get("density"), true, unforced)
+
+    @torch.no_grad()
+    def _energies(self, resolution: ResolvedVelocity, particles: ParticleSet, position: Tensor,
+                  velocity: Tensor) -> Tensor:
+        """Return the energies (frames, bands) of particles with these positions and velocities (frames, n, 3)."""
+        return torch.stack([resolution.band_energies(ParticleSet(particles.id, *moved))
+                            for moved in zip(position, velocity)])
 
 
 def model_for(definition: ModelDefinition, truth: GroundTruth, dtype: torch.dtype,

@@ -34,6 +34,8 @@ VALIDATION_PARTICLES, COMBINED_DRAWS = 8192, 8
 VALIDATIONS, HORIZON_VALIDATIONS = 25, 4
 # Least number of validations within the patience of a phase.
 LEAST_VALIDATIONS = 4
+# Losses of the training on windows that the progress line shows, and their names there.
+HORIZON_LOSSES = {"rollout_loss": "velocity", "density_loss": "density", "energy_loss": "energy"}
 
 Trainer = TypeVar("Trainer")
 
@@ -139,7 +141,8 @@ def take_all_steps(training: Training, guard: Guard, stage: str, section: str, r
     def describe() -> str:
         last = training.history[-1]
         errors = [row["validation_error"] for row in training.history if "validation_error" in row]
-        shown = f"  validation error {errors[-1]:.3f}" if errors else ""
+        parts = ", ".join(f"{name} {last[key]:.3g}" for key, name in HORIZON_LOSSES.items() if key in last)
+        shown = (f" ({parts})" if parts else "") + (f"  validation error {errors[-1]:.3f}" if errors else "")
         return f"{training.phase.name}  loss {last['loss']:.4f}{shown}"
 
     progress = ProgressLine(stage, describe, done=training.done)
