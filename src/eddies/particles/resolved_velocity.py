@@ -135,7 +135,7 @@ class ResolvedFlow:
 
     def _rms_of(self, modes: Tensor, above: float) -> Tensor:
         # The lower bound makes the derivative of the root zero for a fluid at rest.
-        return (self.mean_square(modes, above) / 3).clamp_min(1e-300).sqrt()
+        return (self.mean_square(modes, above) / 3).clamp_min(torch.finfo(torch.float64).tiny).sqrt()
 
 
 class ResolvedVelocity:

@@ -58,7 +58,8 @@ class FilteredEquations(Term):
         kriging, scales, settings = context.kriging, self.flow.scales, self.settings
         velocity = context.without_mean(context.particles.velocity)
         residual, first, second = kriging.derivatives(velocity)
-        speed = mean_over_ranks(context.comm, velocity.square().mean(1, keepdim=True)).clamp_min(1e-300).sqrt()
+        square = mean_over_ranks(context.comm, velocity.square().mean(1, keepdim=True))
+        speed = square.clamp_min(torch.finfo(square.dtype).tiny).sqrt()
         rate = (2 * speed / scales.filter_width).to(first)
         stress = self.stress.to(first) * (scales.filter_width**2 / 12)
         laplacian = second.diagonal(dim1=2, dim2=3).sum(2)
