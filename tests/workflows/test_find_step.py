@@ -98,12 +98,13 @@ def test_the_step_is_the_longest_whose_half_changes_little_of_the_error(comm, sm
 
 
 def ladder(comm, integrator, evaluations, seconds, error):
-    """Rollouts whose velocity is 1.3 + error(h) and should be 1, so that ends within 0.06 have converged."""
+    """Rollouts whose velocity is off by 0.3 + error(h) in units of its rms, so that ends within 0.06 have converged."""
     stretch = object.__new__(find_step.Stretch)
-    stretch.truth, stretch.end = SimpleNamespace(decomposition=SimpleNamespace(comm=comm)), np.ones((4, 3))
+    stretch.truth = SimpleNamespace(decomposition=SimpleNamespace(comm=comm))
+    stretch.end = np.repeat([[1.0], [-1.0]], 2, axis=0) * np.ones(3)
 
     def tried(stretch, step):
-        return find_step.Trial(stretch, step, seconds / step.size, np.full((4, 3), 1.3 + error(step.size)))
+        return find_step.Trial(stretch, step, seconds / step.size, stretch.end + 0.3 + error(step.size))
 
     return find_step.Ladder(tried, [stretch], integrator, 0.32, evaluations)
 
