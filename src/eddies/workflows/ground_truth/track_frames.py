@@ -188,8 +188,8 @@ def _placed(found: Tracks, settings: Settings) -> tuple[Tracks, float, float, np
     if settings.volume is None:
         edge = settings.box if settings.box is not None else found.edge
         if edge is None:
-            raise SceneError("[tracks] box: this key is missing, and the file has no cubic box; give the edge of the "
-                             "periodic cube, or the volume of the measurement")
+            raise SceneError("[tracks] box: this key is missing, and the file has no periodic cubic box; give "
+                             "the edge of the periodic cube, or the volume of the measurement")
         check_inside(found, np.zeros(3), np.full(3, edge), "box", settings.file)
         return found, edge, edge**3, np.zeros(3)
     lower, upper = np.reshape(settings.volume, (3, 2)).T
