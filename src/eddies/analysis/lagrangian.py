@@ -180,6 +180,7 @@ def correlation(initial: np.ndarray, later: np.ndarray) -> float:
 
     The result is NaN if all v(0) or all v(t) are 0.
     """
+    initial, later = initial.astype(float), later.astype(float)  # a product of four single values may overflow
     with np.errstate(invalid="ignore"):
         return float(np.sum(initial * later) / np.sqrt(np.sum(initial**2) * np.sum(later**2)))
 
@@ -190,7 +191,7 @@ def structure_function(velocity: Sequence[np.ndarray], lags: np.ndarray) -> np.n
     `velocity` is (frames, n, 3) at equal intervals; `lags` (m,) count frames. The mean is over particles and over all
     frames t.
     """
-    return _over_lags(velocity, lags, lambda earlier, later: np.mean((later - earlier) ** 2))
+    return _over_lags(velocity, lags, lambda earlier, later: np.mean(np.square(later - earlier, dtype=float)))
 
 
 def increment_flatness(velocity: Sequence[np.ndarray], lags: np.ndarray) -> np.ndarray:
