@@ -1,4 +1,7 @@
-"""Simulated time, the ladder of step sizes (each half the previous one), and the progress line."""
+"""Simulated time, equality of times, the ladder of step sizes (each half the previous one), and the progress line.
+
+No unit of time is special, so round-off is compared with a duration or with an interval between times.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,12 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+import numpy as np
+
 log = logging.getLogger("eddies")
 
+ROUND_OFF = 1e-9             # fraction of a duration that the round-off of a sum of steps does not reach
+SAME = 1e-3                  # fraction of an interval below which two times are the same
 YEAR = 365.25 * 86400.0      # seconds
 YEARS = 10                   # longer durations are given in years
 WARM_UP_STEPS = 2            # first steps, which plan, compile and fill caches; the median leaves them out
@@ -20,38 +27,62 @@ INTERVAL = 5.0               # wall seconds between two progress lines
 
 
 class Clock:
-    """Counts steps and simulated time, up to `end` or until it is stopped."""
+    """Counts steps and simulated time, up to the end of a span or until it is stopped.
 
-    def __init__(self, end: float = math.inf) -> None:
-        self.end, self.time, self.steps = end, 0.0, 0
+    A span begins at the time `began`. Steps are added to `elapsed`, the time since then. So the round-off of a long
+    time before does not reach a short span.
+    """
+
+    def __init__(self, span: float = math.inf) -> None:
+        self.began, self.elapsed, self.span, self.steps = 0.0, 0.0, span, 0
+
+    @property
+    def time(self) -> float:
+        """Simulated time."""
+        return self.began + self.elapsed
 
     @property
     def remaining(self) -> float:
-        """Simulated time that remains; 0 if no more is left than the round-off of the sum of all steps."""
-        left = self.end - self.time
-        return left if left > 1e-9 * max(self.time, 1.0) else 0.0
+        """Simulated time that remains in the span; 0 if no more is left than the round-off of the sum of its steps."""
+        return self.span - self.elapsed if self.elapsed < self.span * (1 - ROUND_OFF) else 0.0
 
     @property
     def running(self) -> bool:
         """Whether time remains."""
         return self.remaining > 0
 
+    def begin(self, span: float = math.inf) -> None:
+        """Begin a span at the present time."""
+        self.began, self.elapsed, self.span = self.time, 0.0, span
+
     def stop(self) -> None:
-        """Set the end to the present time."""
-        self.end = self.time
+        """End the span at the present time."""
+        self.span = self.elapsed
 
     def state_dict(self) -> dict[str, float]:
         """Return the state of the clock, for a checkpoint."""
-        return {"time": self.time, "steps": self.steps, "end": self.end}
+        return {"began": self.began, "elapsed": self.elapsed, "span": self.span, "steps": self.steps}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
         """Restore a state that `state_dict` has returned."""
-        self.time, self.steps, self.end = state["time"], int(state["steps"]), state["end"]
+        self.began, self.elapsed, self.span = state["began"], state["elapsed"], state["span"]
+        self.steps = int(state["steps"])
 
     def tick(self, step: float) -> None:
         """Advance by one step of size `step`."""
         self.steps += 1
-        self.time += step
+        self.elapsed += step
+
+
+def same_times(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows of `first` (m,) and of `second` (n,) that are at the same times, as two arrays of equal length.
+
+    Both are times in ascending order. Two times are the same if they differ by at most SAME times the shortest interval
+    in both, or, without an interval, SAME times the larger time.
+    """
+    intervals = [np.diff(times).min() for times in (first, second) if len(times) > 1]
+    gap = np.abs(np.subtract.outer(first, second))
+    return np.nonzero(gap <= SAME * min(intervals, default=np.abs([*first, *second]).max(initial=0.0)))
 
 
 def ladder_step(largest: float, bound: float) -> float:

@@ -1,15 +1,16 @@
 import numpy as np
+import pytest
 
-from eddies.analysis.track_splines import NO_NOISE, smooth
+from eddies.analysis.track_splines import NO_NOISE, PARABOLA, Fit, smooth
 
 EDGE = 2 * np.pi
 INTERVAL = 0.1
 
 
-def tracks(count=40, frames=50, seed=1):
+def tracks(count=40, frames=50, seed=1, interval=INTERVAL):
     """Sums of three waves along each coordinate, with a drift through the cube; their velocity is known."""
     draw = np.random.default_rng(seed)
-    time = INTERVAL * np.arange(frames)
+    time = interval * np.arange(frames)
     rates, phases = draw.uniform(0.5, 2.5, (3, count, 1, 3)), draw.uniform(0, 2 * np.pi, (3, count, 1, 3))
     start, drift = draw.uniform(0, EDGE, (count, 1, 3)), draw.uniform(-1, 1, (count, 1, 3))
     angle = rates * time[:, None] + phases
@@ -52,6 +53,46 @@ def test_noise_is_removed_and_its_strength_sets_the_smoothing():
     kept = np.sqrt(np.mean((found.position - position[rows]) ** 2))
     assert kept < 0.6 * noise  # a filter with a cut-off at a third of the frequencies leaves 0.58 of white noise
     assert error(found.velocity, velocity[rows]) < 0.25 * error(untreated.velocity, velocity[untreated.rows])
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.98, 1.0])
+@pytest.mark.parametrize("interval, frames, noise, most", [(0.001, 400, 5e-3, 0.012), (0.1, 50, 5e-3, 0.02)])
+def test_fast_and_slow_cameras_need_different_smoothing(interval, frames, noise, most, factor):
+    """The bounds are 1.5 times the least error of any mu. A noise that is given too small does no harm."""
+    time, track, position, velocity = tracks(frames=frames, interval=interval)
+    noisy = position + noise * np.random.default_rng(2).standard_normal(position.shape)
+    found = smooth(time, track, noisy, EDGE, factor * noise)
+    assert error(found.velocity, velocity[found.rows]) < most
+    assert found.residual == pytest.approx(noise, rel=0.05)  # sampling errors are 0.4 to 1 %, and splines miss a little
+
+
+@pytest.mark.parametrize("frames", [4, 50, 4000])
+def test_the_limit_of_strong_smoothing_is_the_parabola_of_least_squares(frames):
+    draw = np.random.default_rng(4)
+    time = np.cumsum(draw.uniform(0.5, 1.5, frames)) * 1e-3
+    positions = 3 + np.sin(3 * time / time[-1])[None, :, None] + 0.1 * draw.standard_normal((2, frames, 3))
+    fit = Fit(time, positions, 1e-3)
+    values = positions.transpose(1, 0, 2).reshape(frames, -1)
+    basis = np.stack([time**0, time / time[-1], (time / time[-1]) ** 2], 1)
+    parabola = (basis @ np.linalg.lstsq(basis, values, rcond=None)[0]).reshape(frames, 2, 3).transpose(1, 0, 2)
+    for smoothing in (PARABOLA * float(frames) ** 6, 1e200):
+        # Round-off of third differences, integrated three times, grows with the cube of the number of rows.
+        np.testing.assert_allclose(next(fit.derivatives(smoothing)), parabola.reshape(-1, 3), rtol=0, atol=1e-7)
+    assert fit.residual(1e200)[2] / 6 == pytest.approx(frames - 3, abs=1e-4)
+
+
+def test_tracks_with_more_noise_than_they_show_become_parabolas():
+    time, track, position, _ = tracks(frames=20)
+    found = smooth(time, track, position, EDGE, noise=10.0)
+    assert 0 < found.residual < 10.0
+    jerk = np.diff(found.position.reshape(40, 20, 3), 3, axis=1)
+    assert np.abs(jerk).max() < 1e-6
+
+
+def test_tracks_of_three_rows_have_no_residuals():
+    found = smooth(np.tile([0.0, 0.1, 0.2], 2), np.repeat([0, 1], 3), np.arange(18.0).reshape(6, 3), None, 0.1)
+    assert np.isnan(found.residual)
+    np.testing.assert_allclose(found.velocity, 30, rtol=1e-6)
 
 
 def test_tracks_begin_and_end_and_have_gaps():

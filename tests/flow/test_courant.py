@@ -28,7 +28,7 @@ def test_the_last_step_ends_at_the_end(comm):
     grid = make_grid(comm, 8)
     velocity, limit = taylor_green(grid, 1.0), CourantLimit(grid, 0.5, 1.0)
     step = limit(velocity, Clock())
-    clock = Clock(end=2.5 * step)
+    clock = Clock(2.5 * step)
     while clock.running:
         clock.tick(limit(velocity, clock))
     assert clock.time == pytest.approx(2.5 * step, rel=1e-15) and clock.steps == 3

@@ -67,7 +67,7 @@ def test_energy_budget_closes(comm, rate, tolerance):
     # The energy with the density in it is no quadratic invariant, so truncation keeps it only as far as the flow is
     # resolved. The injected power is that of a fluid of density 1; the true one differs by M_t^2, here 0.05.
     fluid, state = turbulence(comm, 24, rate=rate)
-    history, clock, advance = FlowHistory(fluid, every=1), Clock(end=0.1), ETDRK4(fluid)
+    history, clock, advance = FlowHistory(fluid, every=1), Clock(0.1), ETDRK4(fluid)
     history.sample(state, clock)
     while clock.running:
         state = advance(state, 0.01)

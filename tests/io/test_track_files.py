@@ -91,6 +91,50 @@ def test_h5md_with_a_constant_interval_and_an_offset(tmp_path):
     assert found.edge == 1 and found.velocity is None
 
 
+def with_box(path, edges, each_frame=False, boundary="periodic"):
+    """An H5MD file of four frames whose box has the given edges, in each frame or once."""
+    with h5py.File(path, "w") as file:
+        holder = file.create_group("particles/all")
+        holder["position/value"] = np.random.default_rng(1).uniform(0, 1, (4, 5, 3))
+        holder["position/time"] = np.arange(4.0)
+        holder["box/edges/value" if each_frame else "box/edges"] = edges
+        holder["box"].attrs["boundary"] = np.array([boundary.encode()] * 3)
+    return path
+
+
+@pytest.mark.parametrize("boundary, edge", [("periodic", 2.0), ("none", None)])
+def test_only_a_periodic_box_of_h5md_has_an_edge(tmp_path, boundary, edge):
+    cubes = [(np.full(3, 2.0), False), (2 * np.eye(3), False), (np.full((4, 3), 2.0), True),
+             (np.tile(2 * np.eye(3), (4, 1, 1)), True)]
+    for number, (edges, each_frame) in enumerate(cubes):
+        assert read_tracks(with_box(tmp_path / f"{number}.h5", edges, each_frame, boundary)).edge == edge
+
+
+@pytest.mark.parametrize("edges, each_frame, words", [
+    (np.eye(3) + np.eye(3, k=-1) / 2, False, "/particles/all/box/edges: the box is triclinic"),
+    (np.tile(np.eye(3) + np.eye(3, k=1) / 9, (4, 1, 1)), True, "/particles/all/box/edges/value: the box is triclinic"),
+    (np.linspace(1, 1.01, 4)[:, None] * np.ones(3), True, "box/edges/value: the box changes in time, first in frame 1"),
+    (np.array([1, 1, 2, 1])[:, None, None] * np.eye(3), True, "the box changes in time, first in frame 2")])
+def test_a_box_of_h5md_that_is_no_constant_cuboid_is_refused(tmp_path, edges, each_frame, words):
+    path = with_box(tmp_path / "md.h5", edges, each_frame)
+    with pytest.raises(ProductError, match=words) as caught:
+        read_tracks(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("names", [
+    ["", "track", "time", "x", "y", "z"], ["track", "time", "x", "y", "z"]], ids=["pandas", "R"])
+@pytest.mark.parametrize("mark", [",", "\t", " ", ";"])
+def test_a_first_column_without_a_name_is_no_track(tmp_path, mark, names):
+    """pandas writes an empty name for it, and R no name at all; R puts names of rows and columns in quotes."""
+    rows = shear(np.linspace(0, 1, 3))
+    quoted = [f'"{name}"' for name in names] if names[0] else names
+    lines = [mark.join(quoted)] + [mark.join([f'"row {number}"', *map(repr, map(float, row))]) for number, row in
+                                   enumerate(np.column_stack([rows[1], rows[0], rows[2]]))]
+    (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
+    assert_same(read_tracks(tmp_path / "a.csv"), rows)
+
+
 def changed(rows, **changes):
     columns = dict(zip(("times", "ids", "positions", "velocities"), (part.copy() for part in rows)))
     for name, value in changes.items():
@@ -110,7 +154,11 @@ def test_rows_that_are_none_are_refused_before_anything_is_written(tmp_path, cha
 @pytest.mark.parametrize("name, content, words", [
     ("a.csv", "track,time,x,y\n1,0,0,0\n", "names track, time, x, y; add or correct z"),
     ("a.csv", "trakc,time,x,y,z\n1,0,0,0,0\n", "names trakc, .*; add or correct track"),
-    ("a.csv", "track,time,x,y,z\n1,0,0,0\n", "as csv"),
+    ("a.csv", "track,time,x,y,z\n1,0,0,0\n", "names 5 columns, but the first row has 4"),
+    ("a.csv", "track,time,x,y,z\n1,0,0,0,0\n1,0,0,0\n", "as csv"),
+    ("a.csv", "track,time,x,y,z\n1,1,1,0,0,0,0\n", "names 5 columns, but the first row has 7"),
+    ("a.csv", "track,time,x,y,z,X\n1,0,0,0,0,0\n", "names 2 columns x;"),
+    ("a.tsv", "time\ttrack\ttime\tx\ty\tz\n1\t0\t0\t0\t0\t0\n", "names 2 columns time;"),
     ("a.csv", "track,time,x,y,z\n1.5,0,0,0,0\n", "whole numbers"),
     ("a.h5", "cut short", "HDF5"), ("a.npz", "cut short", "as npz"), ("a.bin", "", "suffix"),
     (None, "", "no such file")])

@@ -36,7 +36,7 @@ def simulate(comm, cells, duration):
         rows.append((clock.time, budget["total_energy"], budget["dissipation_rate"]))
         if clock.time >= duration - 1e-9:
             return np.array(rows).T
-        clock.end = min(np.floor(clock.time + 1e-9) + 1, duration)
+        clock.span = min(np.floor(clock.time + 1e-9) + 1, duration)
         step = limit(velocity, clock)
         velocity = advance(velocity, step)
         clock.tick(step)

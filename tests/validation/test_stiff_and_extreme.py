@@ -38,7 +38,7 @@ def test_mach_numbers_0_01_and_0_5_take_the_same_steps_and_keep_the_energy_budge
     for mach in (0.01, 0.5):
         fluid, state = turbulence(comm, 24, c=np.sqrt(3) / mach)
         run = FlowRun(fluid, state, ETDRK4(fluid), CourantLimit(fluid.grid, 0.8, 0.05), FlowHistory(fluid, every=1),
-                      lambda run, segments=None: None, Clock(end=0.25))
+                      lambda run, segments=None: None, Clock(0.25))
         run.history.sample(state, run.clock)
         run.advance([run.history])
         assert run.history.rows[0]["mach_turbulent"] == pytest.approx(mach, rel=1e-6)

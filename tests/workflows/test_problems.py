@@ -6,18 +6,21 @@ import functools
 import logging
 import re
 
+import numpy as np
 import pytest
 
+from eddies import write_tracks
 from eddies.scene.integrators import SCHEMES
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 from eddies.scene.terms import FilteredEquations, StepUnits
 from eddies.workflows.foreseen.storage import storage
 from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.problems import check_ground_truth, convenient, memory_of_node, problems
+from eddies.workflows.tracks import with_tracks
 from eddies.workflows.variants import steps
 from tests.bad_scenes import INFEASIBLE
 from tests.changed_product import changed
-from tests.small_scene import TINY, one_model, problems_of
+from tests.small_scene import TINY, one_model, problems_of, scene_file
 from tests.workflows.synthetic_run import write_ground_truth
 
 
@@ -135,6 +138,23 @@ def test_the_pressure_of_filtered_tracks_is_not_found_among_neighbours(comm):
         return [line for line in problems_of(scene, comm)[1] if "the pressure will be useless" in line]
 
     assert len(lines("kriging")) == 1 and lines("kriging", "false") == lines("memory") == []
+
+
+@pytest.mark.mpi(1)
+def test_the_pressure_and_the_acceleration_depend_on_what_lies_beyond_a_volume(comm, tmp_path):
+    draw = np.random.default_rng(1)
+    position = np.tile(draw.uniform(0.1, 0.9, (30, 3)), (3, 1)) + np.repeat([0, 0.01, 0.02], 30)[:, None]
+    write_tracks(tmp_path / "a.h5", np.repeat([0, 1, 2], 30), np.tile(np.arange(30), 3), position)
+
+    def lines(fields, place="volume = [0, 1, 0, 1, 0, 1]"):
+        path = scene_file(tmp_path, f'[tracks]\npath = "a.h5"\nviscosity = 1e-3\n{place}\n[reconstruction]\n'
+                                    f'method = "least-squares"\nfields = ["{fields}"]\n')
+        scene = with_tracks(load_scene(path), comm)
+        return [line for line in problems_of(scene, comm)[1] if "volume" in line]
+
+    assert len(lines("acceleration")) == len(lines("pressure")) == 1
+    assert "acceleration will be inaccurate" in lines("acceleration")[0]
+    assert lines("velocity") == lines("acceleration", "box = 1.0") == []
 
 
 @pytest.mark.mpi(1)

@@ -98,8 +98,7 @@ class StationarySpan:
 
     def __init__(self, statistics: Mapping[str, np.ndarray], spectra: np.ndarray, viscosity: float, start: float,
                  end: float, forced_below: float) -> None:
-        time, tolerance = statistics["time"], 1e-9 * max(1.0, abs(end))
-        inside = (time >= start - tolerance) & (time <= end + tolerance)
+        inside = (statistics["time"] >= start) & (statistics["time"] <= end)
         if inside.sum() < 3:
             raise ValueError(f"only {inside.sum()} samples from t = {start:g} to {end:g}: at least 3 are needed")
         self.columns = {name: values[inside] for name, values in statistics.items()}

@@ -191,7 +191,7 @@ def structure_function(velocity: Sequence[np.ndarray], lags: np.ndarray) -> np.n
     `velocity` is (frames, n, 3) at equal intervals; `lags` (m,) count frames. The mean is over particles and over all
     frames t.
     """
-    return _over_lags(velocity, lags, lambda earlier, later: np.mean((later - earlier) ** 2))
+    return _over_lags(velocity, lags, lambda earlier, later: np.mean(np.square(later - earlier, dtype=float)))
 
 
 def increment_flatness(velocity: Sequence[np.ndarray], lags: np.ndarray) -> np.ndarray:

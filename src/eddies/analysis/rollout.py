@@ -9,6 +9,7 @@ import numpy as np
 
 from eddies.analysis.spectra import band_ratios, spectrum_error
 from eddies.analysis.velocity_gradients import Invariants
+from eddies.clock import ROUND_OFF, same_times
 
 SHOWN = 3   # largest number of times at which a report shows spectra of a rollout
 PLANES = 4  # largest number of times at which a report shows planes of a rollout
@@ -38,13 +39,12 @@ class CommonFrames:
 
     @classmethod
     def of(cls, model: Frames, truth: Frames, until: float = np.inf) -> "CommonFrames":
-        """Pair the frames before `until` whose times agree to 1e-6. Raises ValueError if there are none."""
-        gap = np.abs(model.times[:, None] - truth.times[None, :])
-        same = gap <= 1e-6 * max(1.0, np.ptp(model.times))
-        rows, columns = np.nonzero(same & (model.times < until)[:, None])
-        if rows.size == 0:
+        """Pair the frames before `until` that have the `same_times`. Raises ValueError if there are none."""
+        rows, columns = same_times(model.times, truth.times)
+        early = model.times[rows] < until
+        if not early.any():
             raise ValueError("there is no time at which model and truth both have finite values")
-        return cls(rows, columns, model.times[rows])
+        return cls(rows[early], columns[early], model.times[rows[early]])
 
     def spread(self, count: int) -> np.ndarray:
         """Return the indices of at most `count` common frames, evenly spread from the first to the last."""
@@ -258,7 +258,7 @@ def second_half(times: np.ndarray, end: float) -> np.ndarray:
 
     If there are none, return the last row before `end`, or row 0.
     """
-    rows = np.flatnonzero((times >= end / 2) & (times <= end * (1 + 1e-9)))
+    rows = np.flatnonzero((times >= end / 2) & (times <= end * (1 + ROUND_OFF)))
     return rows if rows.size else np.array([max(int(np.searchsorted(times, end, "right")) - 1, 0)])
 
 
@@ -268,5 +268,5 @@ def _spread(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def _contained(times: np.ndarray, among: np.ndarray) -> np.ndarray:
-    """Return, for each of `times` (m,), whether it is equal to one of the times `among` (l,), to within 1e-6."""
-    return (np.abs(times[:, None] - among[None, :]) < 1e-6).any(axis=1)
+    """Return, for each of `times` (m,), whether it is the same as one of the times `among` (l,)."""
+    return np.isin(np.arange(len(times)), same_times(times, among)[0])

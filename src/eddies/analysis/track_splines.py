@@ -6,7 +6,8 @@ Each track is approximated by a cubic spline s(t) with a knot at each time t_i o
 
 x_i are the measured positions. This estimate assumes that their errors have equal variance, and that the jerk, the
 third derivative of the true position, is white noise (TrackFit; Gesemann, Huhn, Schanz and Schröder 2016). The spline
-damps angular frequencies above mu^(-1/6) / h. It needs no condition at the ends of a track.
+damps angular frequencies above mu^(-1/6) / h. It needs no condition at the ends of a track. For large mu it is a
+parabola, fitted by least squares.
 """
 
 from __future__ import annotations
@@ -17,13 +18,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import BSpline
-from scipy.linalg import solveh_banded
+from scipy.linalg import solve_banded
 from scipy.optimize import brentq
-from scipy.sparse import csr_array, dia_array
+from scipy.sparse import coo_array
 
 DEGREE, LEAST_ROWS = 3, 3   # degree of a spline; fewest rows that determine a parabola, which has no jerk
-NO_NOISE, MOST = 1e-6, 1e6  # smallest and largest mu; the smallest damps no frequency that the frames resolve
+WIDTH = 2 * DEGREE          # diagonals on each side of that of the equations
+NO_NOISE = 1e-6             # smallest mu, which damps no frequency that the frames resolve
+PARABOLA = 1e3              # mu divided by the sixth power of the number of rows, for which a spline is a parabola
 TRIED = 300                 # about the number of tracks from which mu is determined
+BLOCK = 256                 # columns of an influence matrix that are computed at a time
 
 
 @dataclass(frozen=True)
@@ -35,12 +39,15 @@ class SmoothedTracks:
     rows : for each row, its row number in the arguments of `smooth`. Tracks with fewer than three rows are left out.
     position, velocity : (rows, 3). Positions are continuous along a track.
     smoothing : mu of the splines.
+    residual : noise that the residuals of the longest tracks show. It is the given noise if a mu fits it. It is NaN
+        without noise, and for tracks of three rows, which have no residuals.
     """
 
     rows: np.ndarray
     position: np.ndarray
     velocity: np.ndarray
     smoothing: float
+    residual: float
 
 
 def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: float | None,
@@ -52,8 +59,9 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
     time, track : time of each row and number of its track, (rows,). Rows are in any order.
     position : (rows, 3), wrapped into the cube or not.
     edge : edge of a periodic cube, or None. Particles must move by less than half an edge between rows of a track.
-    noise : standard deviation of the error of a measured coordinate. It determines mu: the sum of the squared
-        residuals is then noise^2 times the number of degrees of freedom. If it is 0, mu is NO_NOISE.
+    noise : standard deviation of the error of a measured coordinate. It determines mu: the squared residuals are then
+        those that independent errors of this deviation leave. If it is 0, mu is NO_NOISE. If no mu fits it, `residual`
+        of the result differs from it.
     """
     order = np.lexsort((time, track))
     ends = np.flatnonzero(np.diff(track[order], append=track[order][-1] - 1)) + 1
@@ -65,18 +73,25 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
     groups = [np.array(rows) for rows in alike.values()]
     if not groups:
         nothing = np.zeros((0, 3))
-        return SmoothedTracks(np.zeros(0, int), nothing, nothing, NO_NOISE)
+        return SmoothedTracks(np.zeros(0, int), nothing, nothing, NO_NOISE, np.nan)
     interval = float(np.median(np.concatenate([np.diff(time[rows[0]]) for rows in groups])))
     fits = [Fit(time[rows[0]], _unwrapped(position[rows], edge), interval) for rows in groups]
-    smoothing = _smoothing_of(fits, noise) if noise > 0 else NO_NOISE
+    smoothing, residual = _smoothing_of(fits, noise) if noise > 0 else (NO_NOISE, np.nan)
     values = [np.concatenate(parts) for parts in zip(*(fit.derivatives(smoothing) for fit in fits))]
-    return SmoothedTracks(np.concatenate([rows.ravel() for rows in groups]), *values, smoothing)
+    return SmoothedTracks(np.concatenate([rows.ravel() for rows in groups]), *values, smoothing, residual)
 
 
 class Fit:
     """The splines of tracks with the same times (n,).
 
     `positions` is (tracks, n, 3). `interval` is h, the median interval of all tracks.
+
+    The coefficients c of a spline minimise |x - B c|^2 + mu |J c|^2. With l = mu J c this is
+
+        B^T B c + J^T l = B^T x,   J c - l / mu = 0,
+
+    which is well conditioned for any mu; the equations without l are not for large mu. c_j is unknown 2 j and l_k is
+    unknown 2 k + 3, so that the matrix has few diagonals. Unknowns 1 and 2 n + 1 are not used.
     """
 
     def __init__(self, times: np.ndarray, positions: np.ndarray, interval: float) -> None:
@@ -87,26 +102,38 @@ class Fit:
         self._knots = np.concatenate([times[0] + before * steps[::-1], times, times[-1] + after * steps])
         self._basis = BSpline.design_matrix(times, self._knots, DEGREE)
         unit = BSpline(self._knots, np.eye(len(times) + DEGREE - 1), DEGREE)
-        jerk = csr_array(unit.derivative(DEGREE)((times[1:] + times[:-1]) / 2))
-        self._penalty = interval**5 * jerk.T @ dia_array((np.diff(times)[None], [0]), shape=[len(times) - 1] * 2) @ jerk
+        weight = np.sqrt(interval**5 * np.diff(times))[:, None]
+        jerk = coo_array(weight * unit.derivative(DEGREE)((times[1:] + times[:-1]) / 2))
+        gram = coo_array(self._basis.T @ self._basis)
+        self._bands = np.zeros((2 * WIDTH + 1, 2 * len(times) + 3))
+        self._bands[WIDTH, [1, -2]] = 1
+        for rows, columns, entries in ((2 * gram.row, 2 * gram.col, gram.data),
+                                       (2 * jerk.row + 3, 2 * jerk.col, jerk.data),
+                                       (2 * jerk.col, 2 * jerk.row + 3, jerk.data)):
+            self._bands[WIDTH + rows - columns, columns] = entries
 
     def spline(self, smoothing: float, values: np.ndarray | None = None) -> BSpline:
         """Return the splines with mu = `smoothing` that approximate `values` (n, columns), by default the positions."""
-        matrix = self._basis.T @ self._basis + smoothing * self._penalty
-        bands = np.zeros((DEGREE + 1, matrix.shape[0]))
-        for offset in range(DEGREE + 1):
-            bands[offset, :matrix.shape[0] - offset] = matrix.diagonal(-offset)
-        right = self._basis.T @ (self._values if values is None else values)
-        return BSpline(self._knots, solveh_banded(bands, right, lower=True), DEGREE)
+        values = self._values if values is None else values
+        self._bands[WIDTH, 3:-3:2] = -1 / smoothing
+        right = np.zeros((self._bands.shape[1], values.shape[1]))
+        right[::2] = self._basis.T @ values
+        return BSpline(self._knots, solve_banded((WIDTH, WIDTH), self._bands, right)[::2], DEGREE)
 
-    def residual(self, smoothing: float) -> tuple[float, float]:
-        """Return the sum of squared residuals, and its number of degrees of freedom.
+    def residual(self, smoothing: float) -> np.ndarray:
+        """Return three sums over the values: of the squared residuals, of the squares that errors of variance 1 leave
+        on average, and the degrees of freedom.
 
-        This number is the number of values minus the trace of the matrix that maps values to smoothed values.
+        With the matrix R that maps values to residuals, the last two are the traces of R^T R and of R for each track
+        and axis.
         """
-        squares = float(np.sum((self.spline(smoothing)(self.times) - self._values) ** 2))
-        influence = self.spline(smoothing, np.eye(len(self.times)))(self.times)
-        return squares, 3 * self.tracks * (len(self.times) - float(np.trace(influence)))
+        left, freedom, unit = 0.0, 0.0, np.eye(len(self.times))
+        for first in range(0, len(unit), BLOCK):
+            columns = unit[:, first:first + BLOCK]
+            residuals = columns - self.spline(smoothing, columns)(self.times)
+            left, freedom = left + np.sum(residuals**2), freedom + np.sum(residuals * columns)
+        squares = np.sum((self.spline(smoothing)(self.times) - self._values) ** 2)
+        return np.array([squares, 3 * self.tracks * left, 3 * self.tracks * freedom])
 
     def derivatives(self, smoothing: float) -> Iterator[np.ndarray]:
         """Yield the smoothed positions, then the velocities, each (tracks * n, 3), track after track."""
@@ -115,22 +142,36 @@ class Fit:
             yield np.moveaxis(values.reshape(len(self.times), self.tracks, 3), 1, 0).reshape(-1, 3)
 
 
-def _smoothing_of(fits: list[Fit], noise: float) -> float:
-    """Return the mu for which the residuals of the longest tracks have the variance noise^2.
+def _smoothing_of(fits: list[Fit], noise: float) -> tuple[float, float]:
+    """Return the mu that fits the noise of the longest tracks, and the noise that their residuals show with this mu.
 
-    If no mu between NO_NOISE and MOST has this property, return the nearer of these two.
+    If the noise is too large for any mu, the splines are parabolas. mu is at least the power of ten that minimises the
+    error of generalised cross-validation, which needs no noise. Otherwise a noise that is given 2 % too small would
+    leave nearly all of the noise in the velocities.
     """
     longest = sorted(fits, key=lambda fit: -len(fit.times))
     chosen = longest[:np.searchsorted(np.cumsum([fit.tracks for fit in longest]), TRIED) + 1]
 
-    def excess(logarithm: float) -> float:
-        squares, freedom = np.sum([fit.residual(10.0**logarithm) for fit in chosen], axis=0)
-        return np.log(squares / freedom / noise**2 + 1e-300)
+    rows = len(longest[0].times)
+    if rows <= LEAST_ROWS:
+        return NO_NOISE, np.nan
 
-    low, high = np.log10(NO_NOISE), np.log10(MOST)
-    if excess(low) >= 0:
-        return NO_NOISE
-    return MOST if excess(high) <= 0 else float(10 ** brentq(excess, low, high, xtol=0.01))
+    def sums(logarithm: float) -> np.ndarray:
+        return np.sum([fit.residual(10.0**logarithm) for fit in chosen], axis=0)
+
+    def shown(logarithm: float) -> float:
+        squares, left, _ = sums(logarithm)
+        return float(np.sqrt(squares / left))
+
+    tried = np.arange(np.log10(NO_NOISE), np.log10(PARABOLA * rows**6) + 1)
+    squares, left, freedom = np.transpose([sums(logarithm) for logarithm in tried])
+    fitting = np.flatnonzero(squares <= left * noise**2)
+    best = tried[np.argmin(squares / freedom**2)]
+    if len(fitting):
+        last = fitting[-1]
+        best = max(best, tried[-1] if last == len(tried) - 1 else brentq(
+            lambda logarithm: shown(logarithm) - noise, tried[last], tried[last + 1], xtol=0.01))
+    return float(10.0**best), shown(best)
 
 
 def _unwrapped(positions: np.ndarray, edge: float | None) -> np.ndarray:

@@ -25,7 +25,7 @@ class CourantLimit:
         self._bound = 0.0
 
     def __call__(self, state: np.ndarray, clock: Clock) -> float:
-        """Return the next step; the last step is shortened to end at the clock's end. Collective."""
+        """Return the next step; the last step is shortened to end with the clock's span. Collective."""
         if clock.steps % EVERY == 0 or self._bound == 0.0:
             self._bound = self.bound(state, clock)
         return min(ladder_step(self.largest, self._bound), clock.remaining)
@@ -45,7 +45,7 @@ class CourantLimit:
 
 
 class FixedStep:
-    """Constant time step; the last one is shortened to end at the clock's end."""
+    """Constant time step; the last one is shortened to end with the clock's span."""
 
     def __init__(self, step: float) -> None:
         self.step = step

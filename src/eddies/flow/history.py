@@ -95,8 +95,8 @@ class FlowHistory:
     def describe(self) -> str:
         """Return the last sample as text for the progress line."""
         row = self.rows[-1]
-        return (f"t {row['time']:.3f} ({row['turnovers']:.2f} turnovers)  dt {row['time_step']:.4f}  "
-                f"energy {row['energy']:.4f}  dissipation {row['dissipation_rate']:.4f}  "
+        return (f"t {row['time']:.4g} ({row['turnovers']:.2f} turnovers)  dt {row['time_step']:.4g}  "
+                f"energy {row['energy']:.4g}  dissipation {row['dissipation_rate']:.4g}  "
                 f"Re_lambda {row['reynolds_lambda']:.1f}")
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # `sample` reports what is not finite

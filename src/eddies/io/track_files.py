@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -168,10 +169,27 @@ def _read_h5md(path: Path, group: str | None, interval: float | None) -> Tracks:
         velocity, density = (holder[f"{name}/value"][()] if f"{name}/value" in holder else None
                              for name in ("velocity", "density"))
         ids = next((holder[key][()] for key in ("id", "id/value") if isinstance(holder.get(key), h5py.Dataset)), None)
-        box = holder.get("box", {})
-        edges = box["edges/value"][0] if "edges/value" in box else box["edges"][()] if "edges" in box else []
-        edges = np.unique(np.diag(edges) if np.ndim(edges) == 2 else edges)
+        edges = _edges_of(holder["box"]) if "box" in holder else []
     return _from_frames(times, position, velocity, density, edges, ids)
+
+
+def _edges_of(box: h5py.Group) -> np.ndarray:
+    """Return the different edges of an H5MD box; none if it has none or is not periodic. Raises ValueError if the box
+    changes in time or has edges that are not along the axes."""
+    held = [box[name] for name in ("edges", "edges/value") if isinstance(box.get(name), h5py.Dataset)]
+    if not held or any(mark in ("none", b"none") for mark in box.attrs.get("boundary", ())):
+        return np.zeros(0)
+    [dataset], edges, remedy = held, held[0][()], "give tracks in a constant box with edges along the axes"
+    if dataset.name.endswith("/value"):
+        changed = np.flatnonzero(~np.isclose(edges, edges[0], ROUNDING, 0.0).reshape(len(edges), -1).all(1))
+        if len(changed):
+            raise ValueError(f"{dataset.name}: the box changes in time, first in frame {changed[0]}; {remedy}")
+        edges = edges[0]
+    if edges.ndim == 2:
+        if np.abs(edges - np.diag(np.diag(edges))).max() > ROUNDING * np.abs(edges).max():
+            raise ValueError(f"{dataset.name}: the box is triclinic; {remedy}")
+        edges = np.diag(edges)
+    return np.unique(edges)
 
 
 def _read_npz(path: Path, group: str | None, interval: float | None) -> Tracks:
@@ -197,14 +215,25 @@ def _read_lagrangebench(path: Path, group: str | None, interval: float | None) -
 def _read_csv(path: Path, group: str | None, interval: float | None) -> Tracks:
     with open(path, encoding="utf-8") as file:
         heading = file.readline().lstrip("\ufeff#").strip().lower()
+        first = next((line for line in file if line.strip() and not line.lstrip().startswith("#")), "")
     delimiter = next((mark for mark in ",;\t" if mark in heading), None)
-    names = [name.strip(' "') for name in heading.split(delimiter)]
+    names, columns = ([part.strip(' "') for part in line.rstrip().rstrip(delimiter).split(delimiter)]
+                      for line in (heading, re.sub('"[^"]*"', "quoted", first)))
+    if len(columns) == len(names) + 1:  # the first column holds the names of rows, and has no name
+        names = ["", *names]
+    elif first and len(columns) != len(names):
+        raise ValueError(f"the first line names {len(names)} columns, but the first row has {len(columns)}; name each "
+                         "column once")
     needed = ("track", "time", *AXES)
     for name in needed:
         if name not in names:
             raise ValueError(f"the first line must name the columns {', '.join(needed)}, but it names "
                              f"{', '.join(names)}; add or correct {name}")
     wanted = [*needed, *(["u", "v", "w"] if {"u", "v", "w"} <= {*names} else [])]
+    for name in wanted:
+        if names.count(name) > 1:
+            raise ValueError(f"the first line names {names.count(name)} columns {name}; give each column a name of its "
+                             "own (capital letters do not count)")
     table = np.loadtxt(path, delimiter=delimiter, skiprows=1, usecols=[names.index(name) for name in wanted], ndmin=2,
                        quotechar='"')
     return Tracks(table[:, 1], table[:, 0], table[:, 2:5], table[:, 5:] if len(wanted) > 5 else None)

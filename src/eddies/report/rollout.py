@@ -111,7 +111,7 @@ def _notices(run: Rollout, last: float) -> list[str]:
         notices.append(f"The rollout {run.status} (last frame at {end / turnover:.3g} T).")
     if np.isfinite(run.broken):
         notices.append(f"The model is not finite from {run.broken / turnover:.3g} T on. Only earlier frames are used.")
-    elif end > last + 1e-6:
+    elif end > last:
         notices.append(f"The true tracers end at {last / turnover:.3g} T and the model at {end / turnover:.3g} T. "
                        "Later frames are not compared.")
     return notices

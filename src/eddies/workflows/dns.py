@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from eddies.clock import Clock, ProgressLine
+from eddies.clock import ROUND_OFF, Clock, ProgressLine
 from eddies.flow.history import FlowHistory
 from eddies.io.checkpoint import Guard
 from eddies.io.fields import FieldWriter
@@ -164,12 +164,13 @@ def run_for(flow: FlowRun, time: Time) -> None:
     clock, duration = flow.clock, time.duration
     if flow.phase == "start":
         check_span(time, duration, flow.step_limit.bound(flow.state, clock))
-        flow.began, flow.phase = clock.time, "run"
-    elif clock.time > flow.began + duration * (1 + 1e-9):
+        flow.phase = "run"
+        clock.begin()
+    elif clock.elapsed > duration * (1 + ROUND_OFF):
         raise too_late(flow.guard, f"[time] duration = {duration:g}")
-    start, clock.end = flow.began, flow.began + duration
-    progress = ProgressLine("dns", flow.history.describe, done=(clock.time - start) / duration)
-    flow.advance([flow.history, lambda _, clock: progress((clock.time - start) / duration, clock.steps)])
+    clock.span = duration
+    progress = ProgressLine("dns", flow.history.describe, done=clock.elapsed / duration)
+    flow.advance([flow.history, lambda _, clock: progress(clock.elapsed / duration, clock.steps)])
 
 
 def spin_up(flow: FlowRun, turnovers: float, time: Time) -> None:
@@ -190,7 +191,7 @@ def spin_up(flow: FlowRun, turnovers: float, time: Time) -> None:
             check_span(time, (1 - done) * turnovers * last["eddy_turnover_time"], last["time_step"] or np.inf)
 
     flow.advance([history, until_turned_over])
-    flow.clock.end, flow.phase = np.inf, "start"  # the next phase sets the end
+    flow.phase = "start"
     history.sample(flow.state, flow.clock)
     log.info("spin-up  done  %s", history.describe())
 

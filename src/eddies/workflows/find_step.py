@@ -29,6 +29,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from eddies.clock import ROUND_OFF
 from eddies.import_path import is_path
 from eddies.io.hdf5 import create_product, write_table
 from eddies.parallel.communicator import Comm
@@ -271,7 +272,7 @@ def short_rollout(method: Method, step: TimeStep, stretch: Stretch, stop: StopRe
     method.frame(0.0)  # the rates at the start, which the first step uses
     began, number, complaint = time.perf_counter(), 0, None
     for until in stretch.stops:
-        while complaint is None and method.time < until - 1e-9 * stretch.stops[0]:
+        while complaint is None and method.time < until - ROUND_OFF * stretch.stops[0]:
             stop.check()
             number += 1
             complaint = method.advance(until, number)

@@ -23,7 +23,7 @@ from eddies.parallel.reduction import global_min
 from eddies.particles.flow_units import ScaleError
 from eddies.pipeline import STAGES
 from eddies.scene.scene import (BOX_LENGTH, Flow, Forcing, Initial, Model, Reconstruction, Scene, SceneError,
-                                Simulation, Time, Tracers, Training)
+                                Simulation, Time, Tracers, Tracks, Training)
 from eddies.scene.terms import StepUnits
 from eddies.workflows.foreseen.numbers import Estimates, Turbulence, estimate
 from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
@@ -252,7 +252,7 @@ def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
         for each in tracers.all if tracers is not None else ():
             yield from filter_width(each, scene.flow, scene.initial, scene.forcing)
     if "reconstruct" in stages:
-        yield from unfiltered_quantities(scene.reconstruction, (scene.tracks or tracers).filtered)
+        yield from spoiled_quantities(scene.reconstruction, (scene.tracks or tracers).filtered, scene.tracks)
     if "train" in stages and training is not None:
         yield from untrained_terms(model, training)
     if "simulate" in stages:
@@ -333,14 +333,17 @@ def filter_width(tracers: Tracers, flow: Flow, initial: Initial, forcing: Forcin
                    "particles_per_side")
 
 
-def unfiltered_quantities(settings: Reconstruction, filtered: bool) -> Iterator[str]:
-    """Yield a warning if the pressure or the acceleration is to be reconstructed from neighbours of filtered tracks.
-    Both depend on the velocity before the filter."""
-    wanted = [name for name in ("pressure", "acceleration") if name in settings.fields]
+def spoiled_quantities(settings: Reconstruction, filtered: bool, tracks: Tracks | None) -> Iterator[str]:
+    """Yield a warning if the pressure or the acceleration is to be reconstructed from neighbours of filtered tracks, or
+    in a volume that is not periodic. Both depend on the velocity before the filter, and on that in the whole cube."""
+    wanted = " and ".join(name for name in ("pressure", "acceleration") if name in settings.fields)
     if filtered and settings.of_neighbors and wanted:
-        yield (f'[reconstruction] method = "{settings.method}": the {" and ".join(wanted)} will be useless, because '
-               "undoing the filter of the tracks amplifies the errors of estimates from neighbours; set method = "
-               f'"least-squares" or "memory", or remove {" and ".join(wanted)} from fields')
+        yield (f'[reconstruction] method = "{settings.method}": the {wanted} will be useless, because undoing the '
+               "filter of the tracks amplifies the errors of estimates from neighbours; set method = "
+               f'"least-squares" or "memory", or remove {wanted} from fields')
+    if tracks is not None and tracks.volume is not None and wanted:
+        yield (f"[tracks] volume: the {wanted} will be inaccurate even inside the volume, because the velocity beyond "
+               f"it, which is guessed, has a part in them; remove {wanted} from [reconstruction] fields")
 
 
 def untrained_terms(model: Model, training: Training) -> Iterator[str]:

@@ -16,7 +16,7 @@ from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.exchanges import fluctuations, relative_error
 from eddies.particles.flow_units import ReferenceScales, resolved_wavenumber
-from eddies.particles.particle_set import ParticleSet
+from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.remembered_velocity import RememberedVelocity
 from eddies.particles.resolved_velocity import WEIGHT, ResolvedVelocity
 from eddies.scene.scene import BOX_LENGTH, Reconstruction, Tracers
@@ -25,7 +25,9 @@ from eddies.scene.sections import CELLS_PER_WAVENUMBER
 WEIGHTS = 10.0 ** np.arange(3, -1.1, -0.5)  # weights of the noise in least squares; cross-validation chooses one
 RISE = 1.02             # the search ends when the error exceeds the least error by this factor
 HELD_OUT = 0.1          # share of the particles that cross-validation leaves out
-KNUTH = 2654435761      # spreads ids evenly over 32 bits
+# Shifts and factors that mix all 64 bits of an id (the finaliser of splitmix64; Steele, Lea and Flood 2014). Ids of
+# tracks may have any pattern, such as the number of a camera in their upper bits.
+MIXING = ((30, 0xbf58476d1ce4e5b9), (27, 0x94d049bb133111eb), (31, 1))
 NO_FILTER = 1e-3        # filter width divided by the spacing, for an unfiltered flow
 
 
@@ -66,11 +68,12 @@ def best_solver(particles: ParticleSet, make: Callable[[float], ResolvedVelocity
     `make` makes the solver for a weight. Returns the best solver, its weight, and its error relative to the rms
     velocity. The best weight depends on the filter, the errors of measured velocities and the number of particles,
     none of which is known well. Weights are tried in descending order until the error exceeds the least one by 2 %. If
-    there are too few particles to leave one out, the default weight is taken, and the error is NaN. Collective.
+    there are too few particles to leave one out and to keep one, the default weight is taken, and the error is NaN.
+    Collective.
     """
     known, held_out = split(particles, share)
     default = make(WEIGHT)
-    if not global_sum(default.grid.decomposition.comm, len(held_out.id)):
+    if not global_sum(default.grid.decomposition.comm, np.array([len(known.id), len(held_out.id)])).all():
         return default, WEIGHT, math.nan
     errors: dict[float, float] = {}
     for weight in WEIGHTS.tolist():
@@ -85,7 +88,10 @@ def best_solver(particles: ParticleSet, make: Callable[[float], ResolvedVelocity
 
 def split(particles: ParticleSet, share: float) -> tuple[ParticleSet, ParticleSet]:
     """Split particles by id into the known ones and a `share` that is left out; the same on any number of ranks."""
-    held_out = particles.id * KNUTH % 2**32 < int(share * 2**32)
+    mixed = as_numpy(particles.id).astype(np.uint64)
+    for shift, factor in MIXING:
+        mixed = (mixed ^ mixed >> np.uint64(shift)) * np.uint64(factor)
+    held_out = torch.from_numpy(mixed < np.uint64(share * 2.0**64))
     known, held = (ParticleSet(particles.id[rows], particles.position[rows], particles.velocity[rows])
                    for rows in (~held_out, held_out))
     return known, held

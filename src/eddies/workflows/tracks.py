@@ -39,6 +39,7 @@ from eddies.workflows.track_solver import (NO_FILTER, best_solver, particles_on,
 log = logging.getLogger("eddies")
 
 LEAST_TRACKS = 8        # least number of tracks that a model needs
+LEAST_CELLS = 10        # [flow] cells for few tracks; with fewer, checks of [initial], which is not used, fail
 INTEGRAL_SCALE = 0.2    # integral scale divided by the edge of the box: a guess, for estimates before the run
 ROUNDS = 20             # iterations for the dissipation rate; each reduces the error to a third
 
@@ -115,7 +116,7 @@ def _sections_of(settings: Tracks, learned: bool) -> dict[str, Flow | Tracers]:
                       filter_width=width, turnovers=max(float(tracks.times[-1] / turnover), 1e-6),
                       field_every=settings.field_every)
     viscosity = 0.0 if settings.viscosity is None else settings.viscosity / tracks.unit**2
-    cells, sound = max(tracers.cells, tracers.planes, 8), settings.sound_speed
+    cells, sound = max(tracers.cells, tracers.planes, LEAST_CELLS), settings.sound_speed
     flow = Flow(fluid="incompressible", cells=cells, viscosity=viscosity) if sound is None else Flow(
         fluid="compressible", cells=cells, viscosity=viscosity, sound_speed=sound / tracks.unit)
     return {"flow": flow, "tracers": tracers}

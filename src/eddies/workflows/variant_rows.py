@@ -158,7 +158,7 @@ def before(model: Path | None, step: Path | None, alone: Comm) -> dict[str, Any]
             found["training_steps"] = sum(phase["steps"] for phase in phases)
     if step is not None and step.exists():
         chosen, tried = read_found_step(step, alone)
-        twice = tried["error"][np.isclose(tried["size"], 2 * chosen["size"])]
+        twice = tried["error"][np.isclose(tried["size"], 2 * chosen["size"], atol=0)]
         found |= zip(SEARCH, (chosen["integrator"], chosen["size"], chosen["seconds"], chosen["error"],
                               chosen["error_with_half"], float(twice[0]) if len(twice) else None))
     return found

@@ -32,8 +32,8 @@ class FlowRun:
     """A fluid and its state, the time stepper, the clock and the history of statistics.
 
     `guard` is called before each step, and writes checkpoints. `watch` is called after each step, and ends an unstable
-    run. `phase` is "spin-up", "start" (before the next phase begins), "run" (from the time `began` on) or "tracers"
-    (then `tracers` is set). `max_step` limits the steps with tracers, in addition to `step_limit`.
+    run. `phase` is "spin-up", "start" (before the next phase begins), "run" or "tracers" (then `tracers` is set).
+    `max_step` limits the steps with tracers, in addition to `step_limit`.
     """
 
     fluid: Fluid
@@ -44,7 +44,6 @@ class FlowRun:
     guard: Guard
     clock: Clock = field(default_factory=Clock)
     phase: str = "start"
-    began: float = 0.0
     tracers: TracerRun | None = None
     max_step: float = np.inf
     watch: StabilityWatch = field(init=False)
@@ -76,13 +75,13 @@ class FlowRun:
     def state_dict(self) -> dict[str, Any]:
         """Return the state for a checkpoint, with the state of the tracers."""
         modes = saved_modes(self.fluid.grid, self.state)
-        return {"phase": self.phase, "began": self.began, "modes": modes, "clock": self.clock.state_dict(),
+        return {"phase": self.phase, "modes": modes, "clock": self.clock.state_dict(),
                 "step_limit": self.step_limit.state_dict(), "watch": self.watch.state_dict(),
                 **self.history.state_dict(), **(self.tracers.state_dict() if self.tracers else {})}
 
     def load_state_dict(self, saved: Checkpoint) -> None:
         """Continue from a checkpoint that was made on any number of ranks. The tracers read their own state."""
-        self.phase, self.began = saved["phase"], saved["began"]
+        self.phase = saved["phase"]
         self.state = restored_modes(self.fluid.grid, saved, 4)
         self.clock.load_state_dict(saved["clock"])
         self.step_limit.load_state_dict(saved["step_limit"])
@@ -186,6 +185,7 @@ class TracerRun:
         if saved is None:
             self.released, self.released_at = flow.history.sample(flow.state, flow.clock), flow.clock.time
             self.interval, self.step, self.first_step = 0, 0.0, flow.clock.steps
+            flow.clock.begin()
         else:
             self.released, self.released_at = saved["released"], saved["released_at"]
             self.interval, self.step, self.first_step = saved["interval"], saved["step"], saved["first_step"]
@@ -211,7 +211,7 @@ class TracerRun:
         while self.interval < self.intervals:
             self.interval += 1
             self.step = self._longest_step()
-            flow.clock.end = flow.clock.time + self.settings.frame_interval
+            flow.clock.begin(self.settings.frame_interval)
             self._finish_interval(progress)
 
     def scales(self, name: str) -> dict[str, float]:
@@ -234,7 +234,8 @@ class TracerRun:
 
     @property
     def _done(self) -> float:
-        return (self.flow.clock.time - self.released_at) / (self.intervals * self.settings.frame_interval)
+        of_interval = self.flow.clock.elapsed / self.settings.frame_interval
+        return (max(self.interval - 1, 0) + of_interval) / self.intervals
 
     def _finish_interval(self, progress: ProgressLine) -> None:
         flow, step = self.flow, self.step
@@ -249,7 +250,7 @@ class TracerRun:
     def _store(self) -> None:
         """Store a frame, with filtered fields and spectra in every `field_every`-th frame. Times count from the
         release."""
-        state, fluid, time_since = self.flow.state, self.flow.fluid, self.flow.clock.time - self.released_at
+        state, fluid, time_since = self.flow.state, self.flow.fluid, self.interval * self.settings.frame_interval
         steps, with_fields = self.flow.clock.steps, self.stored % self.settings.field_every == 0
         self.segments.open(steps)
         for each in self.sets.values():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from eddies.analysis.track_splines import smooth
+from eddies.clock import SAME
 from eddies.io.hdf5 import in_files
 from eddies.io.track_files import Tracks, check_inside, check_velocities, checked, read_tracks
 from eddies.parallel.communicator import Comm
@@ -17,9 +19,11 @@ from eddies.parallel.slab import block_starts
 from eddies.scene.scene import BOX_LENGTH, SceneError
 from eddies.scene.sections import Tracks as Settings
 
+log = logging.getLogger("eddies")
+
 UNEQUAL = 0.01    # largest deviation of a time from equal intervals, divided by the interval
-SAME = 1e-3       # fraction of the longest interval below which two times are the same frame
 LEAST_FRAMES = 3
+FITTING = 1.05    # factor by which the noise that tracks show may differ from the given one
 MARGIN = 4.0      # distance between a volume and its periodic image, in mean particle spacings
 
 
@@ -140,6 +144,8 @@ def _read_measured(settings: Settings, state: tuple[int, int] | None) -> Measure
         position, velocity = splines.position[order], splines.velocity[order]
         found = found.chosen(splines.rows[order])
         about["smoothing"] = splines.smoothing
+        if settings.noise > 0 and not 1 / FITTING < splines.residual / settings.noise < FITTING:
+            log.warning("%s", _noise_misfit(settings, splines.residual))
         if len(found.times) < len(times):
             raise SceneError(f"{settings.file}: {len(times) - len(found.times)} of {len(times)} frames have no track "
                              "with three rows or more, which a velocity needs; give the velocities, or longer tracks")
@@ -151,6 +157,18 @@ def _read_measured(settings: Settings, state: tuple[int, int] | None) -> Measure
     spacing = (volume / (len(found.time) / len(times))) ** (1 / 3) / unit
     return MeasuredTracks(times, found.starts, columns, (counts == len(times))[place], spacing, unit, corner,
                           about | {"length_unit": unit, "corner": corner})
+
+
+def _noise_misfit(settings: Settings, shown: float) -> str:
+    """Return the warning for a noise that no smoothing fits; `shown` is the noise that the tracks show."""
+    given = f"{settings.file}: noise = {settings.noise:g}"
+    if np.isnan(shown):
+        return f"{given}: all tracks have three rows, which is too short to remove noise; give longer tracks"
+    if shown > settings.noise:
+        return (f"{given}: the tracks show more noise, {shown:.3g}, which is used; correct noise, or check that errors "
+                "of successive frames are independent")
+    return (f"{given}: the tracks show less noise: the residuals of a parabola for each track are {shown:.3g}, and "
+            "velocities are those of parabolas; lower noise if tracks are not parabolas")
 
 
 def _at_frames(found: Tracks, settings: Settings) -> Tracks:
@@ -188,8 +206,8 @@ def _placed(found: Tracks, settings: Settings) -> tuple[Tracks, float, float, np
     if settings.volume is None:
         edge = settings.box if settings.box is not None else found.edge
         if edge is None:
-            raise SceneError("[tracks] box: this key is missing, and the file has no cubic box; give the edge of the "
-                             "periodic cube, or the volume of the measurement")
+            raise SceneError("[tracks] box: this key is missing, and the file has no periodic cubic box; give "
+                             "the edge of the periodic cube, or the volume of the measurement")
         check_inside(found, np.zeros(3), np.full(3, edge), "box", settings.file)
         return found, edge, edge**3, np.zeros(3)
     lower, upper = np.reshape(settings.volume, (3, 2)).T

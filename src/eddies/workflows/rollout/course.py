@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from eddies.clock import WARM_UP_STEPS, Clock, ProgressLine
+from eddies.clock import ROUND_OFF, WARM_UP_STEPS, Clock, ProgressLine
 from eddies.io.checkpoint import Checkpoint, Guard
 from eddies.io.frame_segments import FrameLayout, FrameSegments, TrajectoryLayout
 from eddies.parallel.migration import IdOrder, wrap
@@ -39,18 +39,22 @@ class Course:
                  saved: Checkpoint | None) -> None:
         self.method, self.segments, self.count, self.interval, self.guard = method, segments, count, interval, guard
         self.comm, self.times = segments.comm, []
-        self.clock, self.seconds, self.energy = Clock(end=count * interval), [], 0.0
+        self.clock, self.seconds, self.energy = Clock(count * interval), [], 0.0
         self._warm_up = WARM_UP_STEPS
         if saved is not None:
             self._load(saved)
             method.load_state_dict(saved)
             log.info("rollout: continues from step %d, time %.4g", self.steps, self.clock.time)
-        self.progress = ProgressLine("rollout", self._describe, done=self.clock.time / self.clock.end)
+        self.progress = ProgressLine("rollout", self._describe, done=self._done)
 
     @property
     def steps(self) -> int:
         """Steps taken so far."""
         return self.clock.steps
+
+    @property
+    def _done(self) -> float:
+        return min(self.clock.elapsed / self.clock.span, 1.0)
 
     def run(self) -> dict[str, float | str]:
         """Advance to the last frame, or until the state is faulty.
@@ -64,13 +68,13 @@ class Course:
             self._store(0.0)
         while complaint is None and (number := len(self.times)) <= self.count:
             until = number * self.interval
-            while complaint is None and self.method.time < until - 1e-9 * self.interval:
+            while complaint is None and self.method.time < until - ROUND_OFF * self.interval:
                 if hasattr(self.method, "state_dict"):
                     self.guard(self, self.segments)
                 else:
                     self.guard.stop.check()
                 complaint = self._step(until)
-                self.progress(min(self.clock.time / self.clock.end, 1.0), self.steps)
+                self.progress(self._done, self.steps)
             if complaint is None:
                 self._store(until)
         if complaint is not None and self.comm.rank == 0:
@@ -125,7 +129,7 @@ class Course:
         self.energy = float(np.sum(square - mean**2)) / 2  # without the mean velocity
 
     def _describe(self) -> str:
-        return f"t {self.clock.time:.3f}  energy {self.energy:.4f}{self.method.status()}"
+        return f"t {self.clock.time:.4g}  energy {self.energy:.4g}{self.method.status()}"
 
 
 def quartiles(seconds: Sequence[float]) -> dict[str, float]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from eddies.analysis.rollout import PLANES, Plane, Rollout
 from eddies.analysis.velocity_gradients import Invariants
+from eddies.clock import same_times
 from eddies.io.hdf5 import ProductError, open_product, read_attributes, read_table
 from eddies.io.provenance import read_provenance
 from eddies.io.trajectories import IMAGE, Trajectory
@@ -47,12 +48,12 @@ class TrueParticles:
     """
 
     def __init__(self, tracers: Trajectory, start_time: float, times: np.ndarray) -> None:
-        at = start_time + times
-        nearest = np.abs(tracers.times[:, None] - at).argmin(axis=0)
-        reached = (np.abs(tracers.times[nearest] - at) < 1e-6) & (0 < nearest) & (nearest < len(tracers.times) - 1)
-        self._tracers, self.times, self.total, self.length = tracers, times[reached], tracers.total, tracers.length
+        frames, reached = same_times(tracers.times, start_time + times)
+        inner = (0 < frames) & (frames < len(tracers.times) - 1)
+        self._tracers, self.total, self.length = tracers, tracers.total, tracers.length
+        self.times = times[reached[inner]]
         #: the frames of the ground truth at `times`
-        self.frames = nearest[reached]
+        self.frames = frames[inner]
         self.columns = (*tracers.columns, "acceleration")
 
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
