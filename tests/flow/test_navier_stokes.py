@@ -7,6 +7,7 @@ from eddies.flow import initial_fields
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
+from eddies.flow.stability import quadratic_energy
 from eddies.flow.statistics import component_energies, compressible_budget, gradient_moments, turbulence_scales
 from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.time_stepping import ETDRK4
@@ -171,3 +172,19 @@ def test_scales_satisfy_the_relations_of_isotropic_turbulence():
     assert nu / scales["kolmogorov_time"] ** 2 == pytest.approx(eps)
     assert scales["kmax_eta"] ** 2 == pytest.approx(64 * nu * scales["kolmogorov_time"])
     assert turbulence_scales(spectrum, 0.0, 0.0, cutoff=8)["reynolds_lambda"] == np.inf
+
+
+@pytest.mark.mpi(2)
+def test_a_mean_velocity_changes_neither_statistics_nor_forcing(comm):
+    """A wind of 1e5 times the velocity; the sums of its modes with others leave round-off of 1e-6."""
+    fluid, state = turbulence(comm, 16, rate=0.5)
+    moving = state.copy()
+    moving[:3] += np.array([1e5, -2e5, 5e4])[:, None, None, None] * (fluid.grid.index_squared == 0)
+    rows, forces = [], []
+    for each in (state, moving):
+        rows.append(FlowHistory(fluid).sample(each, Clock()))
+        forces.append(np.zeros_like(each[:3]))
+        LinearForcing(fluid.grid, 0.5, 1.5).add(each[:3], forces[-1])
+    assert np.array_equal(*forces) and quadratic_energy(fluid, moving) == pytest.approx(quadratic_energy(fluid, state))
+    for name in rows[0].keys() - {"total_energy", "seconds_per_step"}:
+        assert rows[1][name] == pytest.approx(rows[0][name], rel=1e-5, abs=1e-12), name

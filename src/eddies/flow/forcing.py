@@ -7,7 +7,7 @@ from eddies.parallel.reduction import global_sum
 from eddies.spectral.mode_operators import ModeOperators, gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid
 
-# Largest share of the kinetic energy that round-off alone can leave at the forced modes.
+# Largest share of the kinetic energy, without that of the mean velocity, that round-off can leave at the forced modes.
 SILENT = {"float64": 1e-20, "float32": 1e-10}
 
 
@@ -54,7 +54,7 @@ class LinearForcing:
 
     def _require_energy(self, forced: float, velocity: np.ndarray) -> None:
         # One check is enough, because forced modes do not lose all their energy. The sum costs a message.
-        total = self.grid.sum_modes((np.abs(velocity) ** 2).sum(axis=0))
+        total = self.grid.sum_modes((np.abs(velocity) ** 2).sum(axis=0) * (self.grid.index_squared > 0))
         if forced <= SILENT[self.grid.precision] * total:
             raise UserError("[forcing]: the flow has no energy at 0 < |k| < wavenumber = "
                             f"{self.wavenumber:g}, which linear forcing could amplify; start from a flow with "
