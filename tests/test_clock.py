@@ -1,12 +1,51 @@
-"""The progress line: by wall time, also between frames, with the seconds of a step and the remaining time."""
+"""Spans and equal times in any unit. The progress line: by wall time, also between frames, with the seconds of a step
+and the remaining time."""
 
 import logging
 import re
 
+import numpy as np
 import pytest
 
 from eddies import clock
-from eddies.clock import ProgressLine
+from eddies.clock import Clock, ProgressLine, same_times
+from eddies.flow.courant import FixedStep
+
+UNITS = [1e-15, 1e-6, 1.0, 1e6, 1e15]
+
+
+@pytest.mark.parametrize("began", [0.0, 1.0, 1e7])
+@pytest.mark.parametrize("unit", UNITS)
+def test_a_span_takes_all_its_steps_and_no_other_in_any_unit_of_time(unit, began):
+    """Steps of a tenth of a span add up to it with round-off, also after a time that is ten million times as long."""
+    now, step = Clock(), FixedStep(0.3 * unit / 10)
+    now.tick(began * unit)
+    for spans in (1, 2):
+        now.begin(0.3 * unit)
+        while now.running:
+            now.tick(step(None, now))
+        assert now.steps == 10 * spans + 1 and now.elapsed == pytest.approx(0.3 * unit, rel=1e-12)
+    assert now.time == pytest.approx((began + 0.6) * unit, rel=1e-12)
+
+
+def test_a_stopped_span_has_nothing_left_and_a_clock_can_be_restored():
+    now, again = Clock(), Clock()
+    assert now.running and now.remaining == np.inf
+    now.tick(1e-300)
+    now.stop()
+    assert not now.running and now.remaining == 0.0
+    now.begin(2.0)
+    now.tick(0.5)
+    again.load_state_dict(now.state_dict())
+    assert (again.time, again.remaining, again.steps) == (now.time, 1.5, 2)
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_times_are_the_same_relative_to_their_interval(unit):
+    first, second = unit * np.array([0.0, 0.5, 1.0, 1.5]), unit * np.array([0.0, 0.25, 0.5000001, 0.75, 1.01])
+    assert [rows.tolist() for rows in same_times(first, second)] == [[0, 1], [0, 2]]
+    assert [rows.tolist() for rows in same_times(first[1:2], unit * np.array([0.5000001]))] == [[0], [0]]
+    assert [rows.tolist() for rows in same_times(first, np.zeros(0))] == [[], []]
 
 
 @pytest.fixture

@@ -1,5 +1,7 @@
 """Common frames of a rollout and its truth, and the times of its spectra."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -62,3 +64,15 @@ def test_common_frames_before_the_model_broke():
             alone.common
     spread = CommonFrames.of(Still(range(9)), Still(range(9))).spread(3)
     assert spread.tolist() == [0, 4, 8]
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_frames_and_spectra_are_matched_in_any_unit_of_time(unit):
+    """The frames of a rollout are not simultaneous because their interval is a small number."""
+    scaled = {"model": (0.0, 0.5, 1.0, 1.5), "truth": (0.0, 0.5 + 1e-9, 1.0), "flow": (0.0, 1.0, 1.5, 2.0, 2.5)}
+    run = rollout()
+    model, truth = (Still(unit * np.array(scaled[name])) for name in ("model", "truth"))
+    run = replace(run, attributes={"start_time": unit}, model=model, truth=truth,
+                  flow={**run.flow, "time": unit * np.array(scaled["flow"])})
+    assert [rows.tolist() for rows in (run.common.model, run.common.truth)] == [[0, 1, 2], [0, 1, 2]]
+    assert run.spectral().tolist() == [0, 1, 2]

@@ -183,5 +183,16 @@ def test_units_that_contradict_each_other():
     check_velocities(tracks, EDGE, "f")
     with pytest.raises(ProductError, match="outside the box"):
         check_inside(tracks, np.zeros(3), np.full(3, 0.9 * EDGE), "box", "f")
-    with pytest.raises(ProductError, match="0.01 times as far"):
+    with pytest.raises(ProductError, match="move by 0.0[0-9]* between frames .* say [0-9]"):
         check_velocities(Tracks(100 * time, track, position, velocity), EDGE, "f")
+
+
+def test_particles_at_rest_contradict_velocities_only_beyond_the_rounding_of_positions():
+    time, track, position, velocity = shear(np.linspace(0, 1, 11))
+    rest = np.random.default_rng(1).uniform(0, EDGE, (20, 3))[track]
+    for speed in (0.0, 1e-6):  # displacements below the resolution of positions in single precision
+        check_velocities(checked(Tracks(time, track, rest, speed * velocity), "f"), EDGE, "f")
+    with pytest.raises(ProductError, match="particles move by 0 between frames .* velocities say 0.[0-9]*;"):
+        check_velocities(checked(Tracks(time, track, rest, velocity), "f"), EDGE, "f")
+    with pytest.raises(ProductError, match="particles move by 0.[0-9]* between frames .* velocities say 0;"):
+        check_velocities(checked(Tracks(time, track, position, 0 * velocity), "f"), EDGE, "f")

@@ -37,6 +37,25 @@ def table_of(comm, path, name="statistics"):
         return read_table(file, name)
 
 
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("interval", [1e-9, 1e-3])
+def test_short_intervals_after_a_long_spin_up_are_stored_at_their_times(comm, followed, interval):
+    scene = load_scene("tracers-only", [*SMALL, "spin_up.turnovers=0.02", f"tracers.turnovers={interval}",
+                                        f"tracers.frame_interval={interval}"])
+    with open_product(comm, followed("run", scene), "ground_truth") as file:
+        times = Trajectory(file, "tracers").times
+        assert len(times) > 1 and np.diff(times) == pytest.approx(interval, rel=1e-12)
+        assert read_table(file, "statistics")["time_step"][-1] == pytest.approx(interval, rel=1e-3)
+
+
+@pytest.mark.mpi(1)
+def test_an_interval_that_the_rounding_of_the_time_hides_is_refused(comm, followed):
+    scene = load_scene("tracers-only", [*SMALL, "spin_up.turnovers=0.02", "tracers.turnovers=1e-14",
+                                        "tracers.frame_interval=1e-14"])
+    with pytest.raises(SceneError, match="frame_interval = 1e-14: is lost in the rounding of the time"):
+        followed("run", scene)
+
+
 @pytest.mark.mpi(3)
 def test_tracers_are_stored_by_id_and_do_not_depend_on_ranks(comm, followed):
     scene, alone = load_scene("tracers-only", [*SMALL, "tracers.turnovers=0.05"]), comm.Split(comm.rank)

@@ -368,6 +368,74 @@ def test_a_volume_has_no_images(comm, tmp_path):
     assert found.frame(0)["velocity"][0, 0] * found.unit == pytest.approx(1.4, rel=1e-3)
 
 
+def uniform_tracks(comm, folder, wind, given, seed=1):
+    """A file with 100 tracks that all move with the same `wind` (3,), with or without their velocities."""
+    if comm.rank == 0:
+        times, start = 0.01 * np.arange(5), np.random.default_rng(seed).random((100, 3))
+        position = start + np.multiply.outer(times, wind)[:, None]
+        velocity = np.broadcast_to(wind, position.shape).reshape(-1, 3) if given else None
+        write_tracks(folder / "uniform.h5", np.repeat(times, 100), np.tile(np.arange(100), 5),
+                     position.reshape(-1, 3) % 1, velocity, edge=1.0)
+    comm.Barrier()
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("wind, given, method", [
+    ((1.0, 0.5, -0.2), False, "memory"), ((0.0, 0.0, 0.0), True, "least-squares")])
+def test_tracks_that_move_alike_have_a_uniform_field_and_no_relative_error(comm, tmp_path, no_figures, caplog, wind,
+                                                                           given, method):
+    uniform_tracks(comm, tmp_path, wind, given)
+    scene = scene_of(comm, tmp_path, f"""[tracks]
+path = "uniform.h5"
+viscosity = 1e-3
+[reconstruction]
+method = "{method}"
+fields = ["velocity", "gradient"]
+""")
+    run(scene, output=tmp_path / "run", comm=comm)
+    if comm.rank:
+        return
+    assert sum("all tracks move alike: the velocity field is uniform" in line for line in caplog.messages) == 1
+    assert not [line for line in caplog.messages if "not finite" in line]
+    with h5py.File(tmp_path / "run/reconstruction.h5") as file:
+        field = file["fields/reconstructed/velocity"][()]
+        assert np.abs(field - np.reshape(wind, (3, 1, 1, 1))).max() < 1e-7  # stored in single precision
+        assert np.abs(file["fields/reconstructed/gradient"][()]).max() == 0
+        assert "validation_error" not in file["errors_over_time"] and file["about"].attrs["holdout"] == 0
+    with h5py.File(tmp_path / "run/ground_truth.h5") as file:
+        assert file["reference"].attrs["energy"] == 0 and "validation_error" not in file["tracks"].attrs
+    metrics = json.loads((tmp_path / "run/report/metrics.json").read_text())
+    assert metrics["reconstruction"]["validation_error"] is None
+
+
+@pytest.mark.mpi(1)
+def test_tracks_that_move_alike_teach_a_model_nothing(comm, tmp_path):
+    uniform_tracks(comm, tmp_path, (1.0, 0.5, -0.2), True)
+    scene = scene_of(comm, tmp_path, '[tracks]\npath = "uniform.h5"\nviscosity = 1e-3\n[model]\npreset = "resolved"\n'
+                                     '[training]\nframes = 2\nbatch = 10\nsteps = 1\n')
+    with pytest.raises(SceneError, match="uniform.h5: all tracks move alike"):
+        tracks.with_tracks(scene, comm)
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_steady_flow_without_acceleration_has_fields(comm, tmp_path):
+    """Velocities of a shear flow are constant along paths."""
+    if comm.rank == 0:
+        times, start = 0.01 * np.arange(4), np.random.default_rng(1).random((300, 3))
+        velocity = np.column_stack([np.zeros(300), np.sin(2 * np.pi * start[:, 0]), np.zeros(300)])
+        position = start + np.multiply.outer(times, velocity)
+        write_tracks(tmp_path / "steady.h5", np.repeat(times, 300), np.tile(np.arange(300), 4),
+                     position.reshape(-1, 3) % 1, np.tile(velocity, (4, 1)), edge=1.0)
+    scene = tracks.with_tracks(scene_of(comm, tmp_path, '[tracks]\npath = "steady.h5"\nfield_every = 1\n'), comm)
+    tracks.run(scene, comm, tmp_path)
+    with h5py.File(tmp_path / "ground_truth.h5") as file:
+        assert file["reference"].attrs["acceleration_rms"] == 0
+        assert file["tracks"].attrs["validation_error"] < 0.1
+        # The filter of twice the spacing, 0.30, lowers a wave of length 1 by exp(-(2 pi 0.30)^2 / 24).
+        field = file["fields/filtered/velocity"][0, 1] / (2 * np.pi)
+    assert field.max() == pytest.approx(np.exp(-(4 * np.pi * 300 ** (-1 / 3)) ** 2 / 24), abs=0.02)
+
+
 def at_points(field, places):
     """A field (3, z, y, x) on the cube of edge MILLIMETRES at points [z, y, x], by its Fourier series."""
     modes, cells = np.fft.fftn(field, axes=(1, 2, 3)) / field[0].size, field.shape[1]

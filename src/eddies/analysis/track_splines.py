@@ -115,10 +115,16 @@ class Fit:
     def spline(self, smoothing: float, values: np.ndarray | None = None) -> BSpline:
         """Return the splines with mu = `smoothing` that approximate `values` (n, columns), by default the positions."""
         values = self._values if values is None else values
+        # A line is a spline without jerk. Without the line between both ends, round-off is that of what is left.
+        # Coefficients of a line are its values at the means of DEGREE successive knots.
+        places = np.lib.stride_tricks.sliding_window_view(self._knots[1:-1], DEGREE).mean(1)
+        along, rise = (np.append(self.times, places) - self.times[0]) / np.ptp(self.times), values[-1] - values[0]
+        line = values[0] + np.outer(along, rise)
         self._bands[WIDTH, 3:-3:2] = -1 / smoothing
         right = np.zeros((self._bands.shape[1], values.shape[1]))
-        right[::2] = self._basis.T @ values
-        return BSpline(self._knots, solve_banded((WIDTH, WIDTH), self._bands, right)[::2], DEGREE)
+        right[::2] = self._basis.T @ (values - line[:len(values)])
+        solution = solve_banded((WIDTH, WIDTH), self._bands, right)[::2]
+        return BSpline(self._knots, solution + line[len(values):], DEGREE)
 
     def residual(self, smoothing: float) -> np.ndarray:
         """Return three sums over the values: of the squared residuals, of the squares that errors of variance 1 leave

@@ -24,7 +24,9 @@ SPLITS = ("train", "valid", "test")
 FRAMES_OF_A_SPLIT = 3  # the smallest number, because an acceleration needs three frames
 FLUID = 0  # the type of all particles
 CONNECTIVITY = 1.45  # radius of pairs in the data sets of LagrangeBench, divided by the mean distance of particles
-SMALLEST_DEVIATION = 1e-7  # a smaller standard deviation is stored as 1, because LagrangeBench divides by it
+# A standard deviation below this fraction of the edge, the rounding of positions in single precision, is stored as 1,
+# because LagrangeBench divides by it.
+SMALLEST_DEVIATION = float(np.finfo(np.float32).eps)
 
 
 def split_frames(frames: int) -> list[int]:
@@ -59,7 +61,7 @@ def write_dataset(directory: Path, trajectory: Trajectory, case: str, provenance
             file["00000/particle_type"][:] = FLUID
             moments.append(_copy_frames(trajectory, start, file["00000/position"]))
             start += frames
-        about = _metadata(trajectory, lengths) | _statistics(np.array(moments))
+        about = _metadata(trajectory, lengths) | _statistics(np.array(moments), trajectory.length)
         write_files({directory / "metadata.json": json.dumps(
             {"case": case, **about, "provenance": dict(provenance)}, indent=1)})
 
@@ -85,14 +87,14 @@ def _copy_frames(trajectory: Trajectory, start: int, positions: h5py.Dataset) ->
     return sums / np.array([len(positions) - 1, len(positions) - 2])[:, None, None]
 
 
-def _statistics(moments: np.ndarray) -> dict[str, list[float]]:
+def _statistics(moments: np.ndarray, length: float) -> dict[str, list[float]]:
     """Return the means and standard deviations of velocity and acceleration, by their names in metadata.json. `moments`
-    (parts, 2, 2, 3) holds the result of `_copy_frames` for each part."""
+    (parts, 2, 2, 3) holds the result of `_copy_frames` for each part, and `length` is the edge of the box."""
     statistics = {}
     for name, (mean, square) in zip(("vel", "acc"), moments.mean(axis=0)):
         deviation = np.sqrt(np.maximum(square - mean**2, 0))
         statistics[f"{name}_mean"] = mean.tolist()
-        statistics[f"{name}_std"] = np.where(deviation < SMALLEST_DEVIATION, 1.0, deviation).tolist()
+        statistics[f"{name}_std"] = np.where(deviation < SMALLEST_DEVIATION * length, 1.0, deviation).tolist()
     return statistics
 
 

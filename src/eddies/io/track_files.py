@@ -327,8 +327,9 @@ def check_inside(tracks: Tracks, lower: np.ndarray, upper: np.ndarray, key: str,
 
 
 def check_velocities(tracks: Tracks, edge: float | None, path: str | Path) -> None:
-    """Raise ProductError if the median speeds from displacements and from velocities differ by the factor MOST_OFF or
-    more. A unit or the box is then wrong. `edge` is the edge of the periodic cube, or None."""
+    """Raise ProductError if the median displacements between frames, by positions and by velocities, contradict each
+    other: they differ by the factor MOST_OFF or more, and the larger one exceeds the rounding of positions. A unit or
+    the box is then wrong. `edge` is the edge of the periodic cube, or None."""
     order = np.lexsort((tracks.time, tracks.track))
     same = tracks.track[order[1:]] == tracks.track[order[:-1]]
     first, second = order[:-1][same], order[1:][same]  # successive rows of a track
@@ -337,9 +338,11 @@ def check_velocities(tracks: Tracks, edge: float | None, path: str | Path) -> No
     moved = tracks.position[second] - tracks.position[first]
     if edge is not None:
         moved -= edge * np.rint(moved / edge)
-    given = np.linalg.norm(tracks.velocity[first], axis=1)
-    measured = np.linalg.norm(moved, axis=1) / (tracks.time[second] - tracks.time[first])
-    factor = float(np.median(measured) / max(np.median(given), 1e-300))
-    if not 1 / MOST_OFF < factor < MOST_OFF:
-        raise ProductError(f"{path}: particles move {factor:.3g} times as far between frames as their velocities say; "
-                           "correct time_unit, the box, or the unit of the velocities, or leave the velocities out")
+    interval = tracks.time[second] - tracks.time[first]
+    measured = float(np.median(np.linalg.norm(moved, axis=1)))
+    given = float(np.median(np.linalg.norm(tracks.velocity[first], axis=1) * interval))
+    least = ROUNDING * (float(np.ptp(tracks.position)) if edge is None else edge)
+    if max(measured, given) > least and not given / MOST_OFF < measured < given * MOST_OFF:
+        raise ProductError(f"{path}: particles move by {measured:.3g} between frames (median), but their velocities "
+                           f"say {given:.3g}; correct time_unit, the box, or the unit of the velocities, or leave the "
+                           "velocities out")

@@ -87,7 +87,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             if flow.phase != "tracers":
                 saved = None
                 span = scene.tracers.turnovers * flow.history.sample(flow.state, flow.clock)["eddy_turnover_time"]
-                check_span(scene.time, span, flow.step_limit.bound(flow.state, flow.clock), scene.tracers)
+                check_span(scene.time, flow.clock.time, span, flow.step_limit.bound(flow.state, flow.clock),
+                           scene.tracers)
             layout = frame_layout(scene.tracers, fluid.compressible, fluid.grid.cutoff)
             before = () if saved is None else saved.files or [f"../{product.name}"]
             parts = held.enter_context(FrameSegments(comm, guard.checkpoints.path, layout, before))
@@ -163,7 +164,7 @@ def run_for(flow: FlowRun, time: Time) -> None:
     """
     clock, duration = flow.clock, time.duration
     if flow.phase == "start":
-        check_span(time, duration, flow.step_limit.bound(flow.state, clock))
+        check_span(time, clock.time, duration, flow.step_limit.bound(flow.state, clock))
         flow.phase = "run"
         clock.begin()
     elif clock.elapsed > duration * (1 + ROUND_OFF):
@@ -188,7 +189,7 @@ def spin_up(flow: FlowRun, turnovers: float, time: Time) -> None:
             clock.stop()
         elif flow.fluid.forcing is None:
             last = history.rows[-1]
-            check_span(time, (1 - done) * turnovers * last["eddy_turnover_time"], last["time_step"] or np.inf)
+            check_span(time, 0.0, (1 - done) * turnovers * last["eddy_turnover_time"], last["time_step"] or np.inf)
 
     flow.advance([history, until_turned_over])
     flow.phase = "start"

@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
+from eddies.clock import SAME
 from eddies.errors import UserError
 from eddies.flow.stability import REMEDIES, limits_of_step
 from eddies.io.hdf5 import open_product
@@ -393,14 +394,20 @@ at_least, at_most = partial(two_digits, math.ceil), partial(two_digits, math.flo
 # ---- problems that show during the run
 
 
-def check_span(time: Time, span: float, bound: float, tracers: Tracers | None = None) -> None:
-    """Raise SceneError for a flow at rest, or if the time `span` takes too many steps.
+def check_span(time: Time, now: float, span: float, bound: float, tracers: Tracers | None = None) -> None:
+    """Raise SceneError for a flow at rest, or if the time `span` takes too many steps, or vanishes beside the time
+    `now`.
 
-    With `tracers`, also raise it if this time has too many frames. `bound` is the longest step that the present flow
-    allows. A flow at rest has an infinite `span`.
+    With `tracers`, also raise it if this time has too many frames, or if their interval vanishes. `bound` is the
+    longest step that the present flow allows. A flow at rest has an infinite `span`.
     """
     if span == math.inf:
         raise SceneError("the flow is at rest, so that it never turns over; set another [initial] kind or amplitude")
+    shortest = tracers.frame_interval if tracers else span
+    if SAME * shortest < math.ulp(now):
+        place = f"[tracers] frame_interval = {shortest:g}" if tracers else f"[time] duration = {shortest:g}"
+        raise SceneError(f"{place}: is lost in the rounding of the time {now:g} at which it begins; raise it, or "
+                         "shorten [spin_up]")
     key = "step" if time.step else "max_step" if bound >= time.max_step else "courant"
     for problem in [*_too_many_steps(time, key, time.step or min(bound, time.max_step), span),
                     *(_too_many_frames(tracers, span) if tracers else ())]:

@@ -38,8 +38,8 @@ from eddies.workflows.ground_truth.track_frames import TrackFrames, count_for
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import load_form
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
-from eddies.workflows.track_solver import (HELD_OUT, NO_FILTER, best_solver, particles_on, slabs_for, solver_of,
-                                           solving_method, split, validation_error)
+from eddies.workflows.track_solver import (HELD_OUT, NO_FILTER, UniformMethod, best_solver, particles_on, slabs_for,
+                                           solver_of, solving_method, split, validation_error)
 
 log = logging.getLogger("eddies")
 
@@ -84,17 +84,19 @@ class Source:
     slab : this rank's part of the box, with the planes of the grid of the modes.
     most : largest number of particles in a frame.
     truth : the ground truth with true fields; None for measured tracks.
+    uniform : whether all measured tracks of a frame have the same velocity.
     unit : the scene's unit of length, in the unit of the tracks.
     corner : position of the origin of the tracks' coordinates in the cube, in the unit of the tracks.
     """
 
     def __init__(self, tracks: Tracks | None, tracers: Tracers, settings: Reconstruction, file: File,
                  comm: Comm) -> None:
-        self._tracks, self.truth, self.spacing = None, None, tracers.spacing
+        self._tracks, self.truth, self.spacing, self.uniform = None, None, tracers.spacing, False
         filtered, width = (tracks or tracers).filtered, tracers.filter_width
         if tracks is not None:
             self._tracks = source = TrackFrames(comm, tracks)
             self.times, self.spacing, self.most = source.times, source.spacing, source.most
+            self.uniform = source.uniform
             self.unit, self.corner = source.about["length_unit"], source.about["corner"]
             tracers = tracers.with_count(count_for(self.spacing))
         resolved = settings.resolving(tracers, filtered)
@@ -233,15 +235,17 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as file:
         source = Source(scene.tracks, tracers, settings, file, comm)
         solver, weight, _ = best_solver(source.particles(0), partial(solver_of, source.slab, source.scales),
-                                        settings.holdout or HELD_OUT)
+                                        settings.holdout or HELD_OUT, source.uniform)
         filtered = (scene.tracks or tracers).filtered
         grid = solver.grid
         transfer = grid.filter_transfer(tracers.filter_width) if filtered else torch.ones_like(grid.shell)
         kernel: SmoothingKernel = CubicSpline(tracers.radius_of(NEIGHBORS))
         if settings.of_neighbors and scene.kernel is not None and source.truth is not None:
             kernel = load_form(comm, directory / STAGES["train-kernel"].file, source.truth.scales).kernel
-        make = _maker(settings, tracers, scene.flow.viscosity, kernel, solver, weight, transfer)
-        whole = ReconstructionRun(source, [make() for _ in range(2 if settings.holdout > 0 else 1)], solver, settings,
+        make = (partial(UniformMethod, solver) if source.uniform else
+                _maker(settings, tracers, scene.flow.viscosity, kernel, solver, weight, transfer))
+        holdout = 0.0 if source.uniform else settings.holdout
+        whole = ReconstructionRun(source, [make() for _ in range(2 if holdout > 0 else 1)], solver, settings,
                                   tracers, source.scales["viscosity"], transfer)
         saved = guard.checkpoints.newest()
         if saved is not None:
@@ -259,7 +263,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                         write_table(product, name, {key: np.array([row[key] for row in table]) for key in table[0]})
                 product.create_group("about").attrs.update({
                     "method": settings.method, "particles": (BOX_LENGTH / source.spacing) ** 3, "weight": weight,
-                    "length_unit": source.unit, "corner": source.corner, "holdout": settings.holdout,
+                    "length_unit": source.unit, "corner": source.corner, "holdout": holdout,
                     "highest_wavenumber": grid.resolved})
     guard.checkpoints.remove()
     log.info("reconstruct: %s; means over time: %s", settings.method, ", ".join(

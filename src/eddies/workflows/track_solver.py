@@ -14,7 +14,7 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.exchanges import fluctuations, relative_error
+from eddies.particles.exchanges import fluctuations, mean_over_ranks, relative_error
 from eddies.particles.flow_units import ReferenceScales, resolved_wavenumber
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.remembered_velocity import RememberedVelocity
@@ -29,6 +29,23 @@ HELD_OUT = 0.1          # share of the particles that cross-validation leaves ou
 # tracks may have any pattern, such as the number of a camera in their upper bits.
 MIXING = ((30, 0xbf58476d1ce4e5b9), (27, 0x94d049bb133111eb), (31, 1))
 NO_FILTER = 1e-3        # filter width divided by the spacing, for an unfiltered flow
+
+
+class UniformMethod:
+    """Gives the modes of a velocity that is the same at all particles."""
+
+    def __init__(self, solver: ResolvedVelocity) -> None:
+        self._grid = solver.grid
+
+    def of(self, particles: ParticleSet, time: float) -> Tensor:
+        mean = mean_over_ranks(self._grid.decomposition.comm, particles.velocity)
+        return self._grid.with_mean(self._grid.zeros(3), mean)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Do nothing: there is no state."""
 
 
 class LeastSquaresMethod:
@@ -61,19 +78,20 @@ def solving_method(settings: Reconstruction, solver: ResolvedVelocity, viscosity
     return LeastSquaresMethod(solver)
 
 
-def best_solver(particles: ParticleSet, make: Callable[[float], ResolvedVelocity],
-                share: float = HELD_OUT) -> tuple[ResolvedVelocity, float, float]:
+def best_solver(particles: ParticleSet, make: Callable[[float], ResolvedVelocity], share: float = HELD_OUT,
+                uniform: bool = False) -> tuple[ResolvedVelocity, float, float]:
     """Find the weight of the noise by cross-validation on a `share` of the particles that the solve leaves out.
 
     `make` makes the solver for a weight. Returns the best solver, its weight, and its error relative to the rms
     velocity. The best weight depends on the filter, the errors of measured velocities and the number of particles,
     none of which is known well. Weights are tried in descending order until the error exceeds the least one by 2 %. If
-    there are too few particles to leave one out and to keep one, the default weight is taken, and the error is NaN.
-    Collective.
+    there are too few particles to leave one out and to keep one, or if their velocities are `uniform`, the default
+    weight is taken, and the error is NaN. Collective.
     """
     known, held_out = split(particles, share)
     default = make(WEIGHT)
-    if not global_sum(default.grid.decomposition.comm, np.array([len(known.id), len(held_out.id)])).all():
+    counts = global_sum(default.grid.decomposition.comm, np.array([len(known.id), len(held_out.id)]))
+    if uniform or not counts.all():
         return default, WEIGHT, math.nan
     errors: dict[float, float] = {}
     for weight in WEIGHTS.tolist():
@@ -122,10 +140,11 @@ def slabs_for(comm: Comm, tracers: Tracers, resolved: Tracers, filter_width: flo
 def solver_of(slab: SlabDecomposition, reference: Mapping[str, float], weight: float) -> ResolvedVelocity:
     """Make the least-squares solver with this weight of the noise.
 
-    `reference` holds the reference scales, with the names that they have in ground_truth.h5.
+    `reference` holds the reference scales, with the names that they have in ground_truth.h5. The solver does not depend
+    on those of velocity and acceleration, which may be 0.
     """
     scales = ReferenceScales(
-        velocity=reference["velocity_rms"], acceleration=reference["acceleration_rms"],
+        velocity=1.0, acceleration=1.0,
         **{name: reference[name] for name in ("filter_width", "spacing", "density_mean", "viscosity",
                                               "kolmogorov_length")})
     return ResolvedVelocity.on_slabs(slab, scales, weight=weight)

@@ -33,8 +33,8 @@ from eddies.scene.sections import Eulerian, Initial, Reconstruction, Tracks
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.workflows.ground_truth.track_frames import TrackFrames, count_for, read_measured
 from eddies.workflows.run_directory.fingerprints import stage_provenance
-from eddies.workflows.track_solver import (NO_FILTER, best_solver, particles_on, slabs_for, solver_of,
-                                           solving_method)
+from eddies.workflows.track_solver import (NO_FILTER, LeastSquaresMethod, UniformMethod, best_solver, particles_on,
+                                           slabs_for, solver_of, solving_method)
 
 log = logging.getLogger("eddies")
 
@@ -108,6 +108,9 @@ def _sections_of(settings: Tracks, learned: bool) -> dict[str, Flow | Tracers]:
     if learned and present < LEAST_TRACKS:
         raise SceneError(f"{settings.file}: only {present} of {tracks.about['in_file']} tracks are in {where}, but a "
                          f"model needs {LEAST_TRACKS}; give another part of the file")
+    if learned and tracks.uniform:
+        raise SceneError(f"{settings.file}: all tracks move alike, so there is no fluctuation that a model could "
+                         "learn; give other tracks, or remove [kernel], [model] and [simulation]")
     count = present if learned else max(count_for(tracks.spacing), LEAST_TRACKS)
     speed = float(np.sqrt(np.mean(fluctuations(tracks.columns["velocity"])**2)))
     turnover = INTEGRAL_SCALE * BOX_LENGTH / speed if speed > 0 else math.inf
@@ -146,8 +149,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         slab = slabs_for(comm, own, resolved, width, found["kolmogorov_length"])
         particles = particles_on(slab, tracks.frame(0))
         make = partial(solver_of, slab, found | {"spacing": resolved.spacing, "filter_width": width})
-        solver, weight, error = best_solver(particles, make)
-        flow = FrameFlow(solver.grid, solver.of(particles).modes, particles, filtered, tracers.filter_width)
+        solver, weight, error = best_solver(particles, make, uniform=tracks.uniform)
+        first_method = UniformMethod(solver) if tracks.uniform else LeastSquaresMethod(solver)
+        flow = FrameFlow(solver.grid, first_method.of(particles, 0.0), particles, filtered, tracers.filter_width)
         found = flow.scales(viscosity) | reference  # velocity_rms is that of the particles
     reference = found
     coarse = SpectralGrid(SlabDecomposition(comm, BOX_LENGTH, tracers.cells), cutoff=(tracers.cells - 1) // 2)
@@ -163,7 +167,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                       if count >= LEAST_TRACKS else None)
         fields = FieldWriter(file, "filtered", coarse.cells, {"velocity": 3})
         # A memory is of an unfiltered flow: G = 1.
-        method = solving_method(settings, solver, viscosity, torch.ones_like(solver.grid.shell), weight)
+        method = UniformMethod(solver) if tracks.uniform else solving_method(
+            settings, solver, viscosity, torch.ones_like(solver.grid.shell), weight)
         rows, spectra = [], []
         for frame, time in enumerate(times):
             if stop is not None:
@@ -199,7 +204,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         write_table(file, "spectra", {"wavenumber": np.arange(table["energy"].shape[1]), **table})
         file.create_group("tracks").attrs.update({
             **tracks.about, "complete": complete, "mean_count": tracks.mean_count, "weight": weight,
-            "validation_error": error, "traced": follows})
+            **({} if math.isnan(error) else {"validation_error": error}), "traced": follows})
     log.info("dns: %d tracks, on average %.0f in a frame; %d are in each of the %d frames; duration %.3g T, u' = %.3g, "
              "L = %.3g",
              tracks.about["in_file"], tracks.mean_count, complete, len(times),
@@ -224,7 +229,8 @@ class FrameFlow:
         whole, self.filtered = (modes * (1 / transfer), modes) if filtered else (modes, modes * transfer)
         among = grid.at(grid.without_mean(modes), grid.points(particles.position))
         square, count = global_sum(comm, np.array([float(among.square().sum()), len(particles.id)]))
-        share = square / count / (2 * energy_spectrum(grid.spectral, as_numpy(modes)).sum())
+        whole_square = 2 * energy_spectrum(grid.spectral, as_numpy(modes)).sum()
+        share = square / count / whole_square if whole_square > 0 else 1.0
         self.energy, self.filtered_energy = (share * energy_spectrum(grid.spectral, as_numpy(each))
                                              for each in (whole, self.filtered))
 

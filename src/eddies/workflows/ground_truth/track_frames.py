@@ -22,6 +22,7 @@ from eddies.scene.sections import Tracks as Settings
 log = logging.getLogger("eddies")
 
 UNEQUAL = 0.01    # largest deviation of a time from equal intervals, divided by the interval
+EQUAL = 1e-12     # fraction of a velocity below which velocities are equal
 LEAST_FRAMES = 3
 FITTING = 1.05    # factor by which the noise that tracks show may differ from the given one
 MARGIN = 4.0      # distance between a volume and its periodic image, in mean particle spacings
@@ -38,6 +39,7 @@ class MeasuredTracks:
     starts : first row of each frame, and at the end the number of rows, (frames + 1,).
     columns : `id` (rows,), `position` and `velocity` (rows, 3). With [tracks] sound_speed also `density` (rows,), in
         units of its mean.
+    uniform : whether all tracks of a frame have the same velocity, in each frame.
     throughout : whether the track of a row is present in all frames, (rows,).
     spacing : mean particle spacing, the cube root of (volume with particles / mean number of rows of a frame).
     unit : the scene's unit of length, in the unit of the file.
@@ -48,6 +50,7 @@ class MeasuredTracks:
     times: np.ndarray
     starts: np.ndarray
     columns: Mapping[str, np.ndarray]
+    uniform: bool
     throughout: np.ndarray
     spacing: float
     unit: float
@@ -86,9 +89,10 @@ class TrackFrames:
 
     def __init__(self, comm: Comm, settings: Settings) -> None:
         self.comm = comm
-        self.times, self.about, self.mean_count, self.complete, self.spacing, self.most = in_files(
-            comm, settings.file, lambda: ((found := read_measured(settings)).times, found.about, found.mean_count,
-                                          found.complete, found.spacing, int(np.diff(found.starts).max())))
+        self.times, self.about, self.mean_count, self.complete, self.spacing, self.uniform, self.most = in_files(
+            comm, settings.file, lambda: (
+                (found := read_measured(settings)).times, found.about, found.mean_count, found.complete, found.spacing,
+                found.uniform, int(np.diff(found.starts).max())))
         self._tracks = read_measured(settings) if comm.rank == 0 else None
 
     def frame(self, number: int, complete: bool = False) -> dict[str, np.ndarray]:
@@ -155,8 +159,19 @@ def _read_measured(settings: Settings, state: tuple[int, int] | None) -> Measure
     if settings.sound_speed is not None:
         columns["density"] = found.density / found.density.mean()
     spacing = (volume / (len(found.time) / len(times))) ** (1 / 3) / unit
-    return MeasuredTracks(times, found.starts, columns, (counts == len(times))[place], spacing, unit, corner,
+    uniform = _uniform(columns["velocity"], found.starts, times[1])
+    if uniform:
+        log.warning("%s: all tracks move alike: the velocity field is uniform, and there are no errors relative to "
+                    "its fluctuation", settings.file)
+    return MeasuredTracks(times, found.starts, columns, uniform, (counts == len(times))[place], spacing, unit, corner,
                           about | {"length_unit": unit, "corner": corner})
+
+
+def _uniform(velocity: np.ndarray, starts: np.ndarray, interval: float) -> bool:
+    """Return whether the velocities (rows, 3) of each frame differ by no more than the round-off of the velocities, and
+    of positions divided by the frame interval."""
+    highest, lowest = (extreme.reduceat(velocity, starts[:-1]) for extreme in (np.maximum, np.minimum))
+    return bool((highest - lowest).max() <= EQUAL * max(np.abs(velocity).max(), BOX_LENGTH / interval))
 
 
 def _noise_misfit(settings: Settings, shown: float) -> str:

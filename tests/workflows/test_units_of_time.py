@@ -1,0 +1,47 @@
+"""A flow in another unit of time has the same numbers without dimension, from the direct simulation to the report."""
+
+import json
+import math
+
+import pytest
+
+from eddies import run
+from eddies.scene.scene import load_scene
+from tests.workflows.small_rollout import scene_text
+
+# Powers of the unit of time in the numbers of a report. All others have no dimension.
+POWERS = {"energy": -2, "dissipation_rate": -3, "eddy_turnover_time": 1, "kolmogorov_time": 1, "velocity_rms": -1,
+          "acceleration_rms": -2, "delay": 1, "time step": 1}
+OF_THE_COMPUTER = ("second", "(s)", "storing")
+
+
+def numbers(values, place=()):
+    """The entries of nested dicts, by their path."""
+    for key, value in values.items():
+        if isinstance(value, dict):
+            yield from numbers(value, (*place, key))
+        elif not any(word in key for word in OF_THE_COMPUTER):
+            yield (*place, key), value
+
+
+def metrics_of(comm, folder, unit):
+    """The numbers of the report of a small scene whose times are multiplied by `unit`."""
+    own = ["flow.viscosity=%r" % (0.1 / unit), "flow.sound_speed=%r" % (15 / unit), "initial.amplitude=%r" % (1 / unit),
+           "time.max_step=%r" % (0.05 * unit), "tracers.frame_interval=%r" % (0.02 * unit),
+           "simulation.step=%r" % (0.02 * unit), "simulation.frame_interval=%r" % (0.04 * unit)]
+    folder.mkdir()
+    (folder / "own.toml").write_text(scene_text())
+    run(load_scene(folder / "own.toml", own), output=folder / "run", comm=comm)
+    return dict(numbers(json.loads((folder / "run/report/metrics.json").read_text())))
+
+
+@pytest.mark.mpi(1)
+def test_numbers_without_dimension_do_not_depend_on_the_unit_of_time(comm, tmp_path, no_figures, quick_spectra):
+    """Units that are powers of two change no digit, so that numbers are equal."""
+    powers = (0, -20, 20)
+    first, *others = (metrics_of(comm, tmp_path / str(power), 2.0**power) for power in powers)
+    assert len(first) > 50
+    for power, found in zip(powers[1:], others):
+        for place, value in first.items():
+            change = POWERS.get(place[-1], 0) if isinstance(value, (int, float)) else 0
+            assert found[place] == (math.ldexp(value, power * change) if change else value), place
