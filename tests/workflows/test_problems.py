@@ -44,6 +44,20 @@ def test_built_in_scenes_have_no_problem_but_missing_runs(comm, name):
     if name == "cbc":  # its truth is an experiment
         others = [line for line in others if "cannot be compared" not in line]
     assert all("no such file" in line for line in refused) and all("path" in line or "train" in line for line in others)
+    assert not any("this very flow" in line for line in others), "rollouts start outside the training"
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("name, changes, variants", [
+    ("tiny", ["simulation.start=0.2"], "paper, resolved, local"),
+    ("tiny", ["realisations=[5]", "initial.kind=taylor-green", "initial.peak_wavenumber=3.0"],
+     "paper, resolved, local"),
+    ("tiny", ["seed=99", "realisations=[1]", "variant.resolved.model.path=eddies:tiny"], "resolved")])
+def test_a_rollout_within_the_training_of_its_model_is_named(comm, name, changes, variants):
+    """Also on a realisation that is the flow of the training, with weights of this job or of the package. Coarse grids
+    learn nothing."""
+    found = [line for line in problems_of(load_scene(name, changes), comm)[1] if "this very flow" in line]
+    assert len(found) == 1 and found[0].startswith(f"variant {variants}: "), found
 
 
 @pytest.mark.mpi(1)

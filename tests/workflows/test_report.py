@@ -19,6 +19,7 @@ from eddies.workflows.rollout.measured import open_rollout
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 from eddies.workflows.status import status_lines
 from tests.changed_product import changed
+from tests.small_scene import one_model
 from tests.workflows.stopping import StopAtStep
 from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_model, write_rollout, write_run
 from tests.workflows.test_variant_rows import REALISED, scene_of
@@ -398,6 +399,18 @@ def test_a_rollout_of_other_settings_is_left_out_of_the_comparison(comm, tmp_pat
     assert "../plain/report/index.html" in page and "../free/report/index.html" not in page
     assert any(words in sentence for sentence in written(tmp_path / "plain")[0]["warnings"])
     assert any(line.strip().startswith("plain: simulate") and words in line for line in status_lines(tmp_path))
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_a_rollout_within_the_training_of_its_model_is_named_at_the_top(comm, tmp_path, capfd):
+    write_run(comm, tmp_path)
+    scene = one_model("tiny", ["simulation.start=0.1"])
+    for kind in ("model", "rollout"):
+        with changed(tmp_path / f"{kind}.h5") as file:
+            origin = json.loads(file.attrs["provenance"])
+            file.attrs["provenance"] = json.dumps(origin | {"scene": scene.to_toml()})
+    said, = warnings_of(tmp_path, capfd)
+    assert said.startswith("rollout.h5 (made 20") and "trained on this very flow up to 0.3 turnovers" in said
 
 
 @pytest.mark.usefixtures("no_figures")

@@ -16,6 +16,7 @@ from eddies.errors import UserError
 from eddies.flow.stability import REMEDIES, limits_of_step
 from eddies.io.hdf5 import open_product
 from eddies.io.new_files import LARGEST_BYTES, REMEDY, has_single_writer
+from eddies.io.provenance import product_provenance
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm, node_ranks
@@ -30,6 +31,7 @@ from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
 from eddies.workflows.foreseen.storage import Storage, in_units, most_disk, storage
 from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.ground_truth.scene_flow import given_spectrum, stored_states
+from eddies.workflows.learned.seen import seen_by, seen_flows, start_within_training
 from eddies.workflows.learned.source import ModelDefinition, read_source
 from eddies.workflows.variants import Step
 
@@ -66,6 +68,7 @@ def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = 
     refused: dict[str, None] = {}
     doubts: dict[str, list[str]] = {}
     needs: list[Storage] = []
+    learned: dict[Path, dict[str, float]] = {}  # the flows that each model of the planned steps has seen
     for step in planned:
         own, stages = step.scene, step.stages
         refused |= dict.fromkeys(f"{own.name}: {problem}" for problem in _infeasible(step, comm, made))
@@ -76,7 +79,8 @@ def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = 
             own.initial if "dns" in stages and own.tracks is None else None,
             ModelDefinition.of(own) if given else None, own.name,
             own.device if {"train", "simulate"} & {*stages} else "cpu", comm))
-        for doubt in _warnings(step, made):
+        within = on_first_rank(comm, partial(_start_within_training, step, learned))
+        for doubt in (*_warnings(step, made), *within):
             doubts.setdefault(doubt, []).append(step.variant or "")
         for stage in stages:
             needs.append(storage(own, stage, comm.size))
@@ -87,6 +91,10 @@ def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = 
     if scene.sets and scene.kernel is not None and not scene.variant:
         doubts[f"[tracers] set: is absent, so that only the ground truths of {', '.join(scene.sets)} are made; "
                "choose one of them for kernel, model and rollout"] = []
+    initial = scene.initial
+    if scene.realisations and not initial.flow.seeded and not initial.flow.from_file:
+        doubts[f'realisations: [initial] kind = "{initial.kind}" does not depend on the seed, so all realisations are '
+               "the same flow, with other places of the particles; choose another kind, or remove realisations"] = []
     if needed > free_disk:
         doubts[f"the stages need about {in_units(needed)} of disk, and {in_units(free_disk)} are free here; "
                "choose another --output, or raise [tracers] frame_interval or field_every"] = []
@@ -265,6 +273,22 @@ def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
     if "train" in stages and model.path and model.weights_file not in made and not model.weights_file.is_file():
         yield (f'[model] path = "{model.path}": `eddies train` needs {model.weights_file}, which does not exist yet; '
                "train that model first, or give another path")
+
+
+def _start_within_training(step: Step, learned: dict[Path, dict[str, float]]) -> list[str]:
+    """Return a warning, in a list, if the rollout of a step starts within the training of its model. `learned` maps the
+    model files of earlier steps to the flows that these models have seen; that of this step is added."""
+    scene, directory = step.scene, step.links.get("dns", step.directory)
+    if scene.model is None or not {"train", "simulate"} & {*step.stages}:
+        return []
+    weights = scene.model.weights_file
+    if weights is None:
+        seen = seen_flows(scene, directory)
+    else:
+        seen = learned[weights] if weights in learned else seen_by(product_provenance(weights), weights.parent)
+    learned[step.directory / STAGES["train"].file] = seen
+    found = start_within_training(scene, directory, seen) if "simulate" in step.stages else None
+    return [] if found is None else [found]
 
 
 def resolution(flow: Flow, turbulence: Turbulence) -> Iterator[str]:

@@ -13,7 +13,8 @@ from eddies.io.errors import remedy_for
 from eddies.io.hdf5 import File, read_attributes, stored_numbers
 from eddies.io.provenance import product_provenance
 from eddies.pipeline import MAKER_OF, STAGES
-from eddies.scene.scene import Scene
+from eddies.scene.scene import Scene, stored_scene
+from eddies.workflows.learned.seen import seen_by, start_within_training
 from eddies.workflows.run_directory.work import changed_settings, differences, of_other_settings
 from eddies.workflows.variants import steps
 
@@ -33,7 +34,16 @@ def doubts(directory: Path, provenance: Mapping[str, Provenance], old: Mapping[P
     found = [f"{_made(kind, origin)} was made with {of_other_settings(old[path])} than those of the last job; "
              f"{remedy_for(kind, MAKER_OF[kind].file)}, or note that the report shows it as it was made"
              for kind, origin in provenance.items() if (path := directory / MAKER_OF[kind].file) in old]
-    return [*found, *mixed_products(provenance), *changed_truths(provenance.get("model", {}))]
+    return [*found, *mixed_products(provenance), *changed_truths(provenance.get("model", {})),
+            *_start_within_training(directory, provenance)]
+
+
+def _start_within_training(directory: Path, provenance: Mapping[str, Provenance]) -> list[str]:
+    """Return a sentence, in a list, if the rollout starts within the training of the model beside it."""
+    model, rollout = provenance.get("model"), provenance.get("rollout")
+    scene = stored_scene(rollout.get("scene", "")) if model and rollout else None
+    found = scene and start_within_training(scene, directory, seen_by(model, directory))
+    return [f"{_made('rollout', rollout)}: {found}"] if found else []
 
 
 def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
