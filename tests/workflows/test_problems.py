@@ -64,6 +64,7 @@ def test_a_rollout_within_the_training_of_its_model_is_named(comm, name, changes
 @pytest.mark.parametrize("given, words, remedy", [
     ("flow.viscosity=0.05", "k_max eta is about 0.88", "flow.viscosity={viscosity to}"),
     ("flow.viscosity=0.05", "[flow] cells = 24", "flow.cells={raise cells to}"),
+    ("flow.viscosity=0", "the flow has no stationary state, and k_max eta", "flow.viscosity={raise viscosity to}"),
     ("flow.cells=120", "k_max eta is about 5.6", "flow.cells={lower cells to}"),
     ("flow.sound_speed=4", "Mach number is about 0.47: above 0.3", "flow.sound_speed={raise sound_speed to}"),
     ("flow.sound_speed=1.5", "supersonic", "flow.sound_speed={raise sound_speed to}"),

@@ -311,6 +311,19 @@ def test_tracers_of_the_whole_flow_are_described_as_such(comm, tmp_path, section
 
 
 @pytest.mark.usefixtures("no_figures")
+def test_a_flow_without_dissipation_has_no_resolution(comm, tmp_path):
+    """Its Kolmogorov length is stored as 0, which is no measure of the grid."""
+    write_ground_truth(comm, tmp_path)
+    with changed(tmp_path / "ground_truth.h5") as file:
+        file["statistics/kmax_eta"][...] = 0.0
+        file["reference"].attrs.update(kolmogorov_length=0.0, kmax_eta=0.0)
+    report.run(tmp_path, comm)
+    metrics, page = written(tmp_path)
+    assert metrics["ground_truth"]["kmax_eta"] is None and "there is no smallest scale to resolve" in page
+    assert "η = 0" not in page and metrics["ground_truth"]["reynolds_lambda"] > 0
+
+
+@pytest.mark.usefixtures("no_figures")
 def test_a_rollout_without_its_ground_truth(comm, tmp_path):
     write_rollout(comm, tmp_path)
     report.run(tmp_path, comm)

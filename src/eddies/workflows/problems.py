@@ -9,10 +9,12 @@ import math
 import os
 import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from eddies.errors import UserError
+from eddies.import_path import is_path
 from eddies.flow.stability import REMEDIES, limits_of_step
 from eddies.io.hdf5 import open_product
 from eddies.io.new_files import LARGEST_BYTES, REMEDY, has_single_writer
@@ -26,7 +28,7 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import (BOX_LENGTH, Flow, Forcing, Initial, Model, Reconstruction, Scene, SceneError,
                                 Simulation, Time, Tracers, Training)
 from eddies.scene.terms import StepUnits
-from eddies.workflows.foreseen.numbers import Estimates, Turbulence, estimate
+from eddies.workflows.foreseen.numbers import Estimates, Turbulence, estimate, expected_turbulence
 from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
 from eddies.workflows.foreseen.storage import Storage, in_units, most_disk, storage
 from eddies.workflows.ground_truth.frame_counts import check_frames
@@ -252,6 +254,7 @@ def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
     scene, stages, expected = step.scene, step.stages, estimate(step.scene)
     tracers, model, training, simulation = scene.tracers, scene.model, scene.own_training, scene.simulation
     if "dns" in stages and scene.tracks is None:
+        yield from inviscid_turbulence(scene.flow, scene.initial, scene.forcing)
         if expected.turbulence is not None:
             yield from resolution(scene.flow, expected.turbulence)
             yield from laminar_flow(scene.flow, expected.turbulence)
@@ -289,6 +292,19 @@ def _start_within_training(step: Step, learned: dict[Path, dict[str, float]]) ->
     learned[step.directory / STAGES["train"].file] = seen
     found = start_within_training(scene, directory, seen) if "simulate" in step.stages else None
     return [] if found is None else [found]
+
+
+def inviscid_turbulence(flow: Flow, initial: Initial, forcing: Forcing | None) -> Iterator[str]:
+    """Yield a warning if nothing dissipates the energy of a turbulent or forced flow."""
+    forced = forcing is not None and forcing.injection_rate > 0
+    if flow.viscosity > 0 or is_path(flow.fluid) or not (forced or initial.flow.turbulent):
+        return
+    viscosity = (KMAX_ETA[0] / flow.largest_wavenumber) ** (4 / 3) * (
+        expected_turbulence(replace(flow, viscosity=1.0), initial, forcing).dissipation_rate ** (1 / 3))
+    fate = ("the energy of [forcing] is never dissipated, so the flow has no stationary state" if forced else
+            "no energy is dissipated, so it gathers at the smallest scales of the grid")
+    yield (f"[flow] viscosity = 0: {fate}, and k_max eta, which tells whether a grid resolves the smallest scales, has "
+           f"no value; raise viscosity to {at_least(viscosity)}{', or remove [forcing]' if forced else ''}")
 
 
 def resolution(flow: Flow, turbulence: Turbulence) -> Iterator[str]:
