@@ -3,10 +3,10 @@
     mpirun -n 2 .venv/bin/python -m mpi4py tests/benchmarks/particle_step.py [PARTICLES A SIDE] [--model NAME]
         [--threads T] [--precision float64]
 
-A model with initial weights, and the damping learned in hit-small, moves random particles in a solenoidal velocity with
-a turbulent spectrum, filtered at two particle spacings. Steps have the length of a rollout; ten steps warm up. Prints a
-JSON line with medians over the steps: seconds per evaluation of the slowest rank and of each part, iterations of a
-solve, and evaluations and seconds per turnover of the field.
+A model of any preset with initial weights, and the damping learned in hit-small, moves random particles in a solenoidal
+velocity with a turbulent spectrum, filtered at two particle spacings. Steps have the length of a rollout; ten steps
+warm up. Prints a JSON line with medians over the steps: seconds per evaluation of the slowest rank and of each part,
+iterations of a solve (null without solves), and evaluations and seconds per turnover of the field.
 """
 
 import argparse
@@ -31,19 +31,19 @@ from eddies.kernels.modes import ModePasses
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.context import Context
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.flow_units import FlowUnits, ReferenceScales, allowed_step
+from eddies.particles.flow_units import FlowUnits, ReferenceScales, allowed_step, resolved_wavenumber
 from eddies.particles.fourier_grid import Points
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.least_squares import LeastSquares
 from eddies.particles.model import build_model
 from eddies.particles.neighborhood import Neighborhood
-from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.scene.sections import Tracers
-from eddies.scene.terms import PRESETS, TERMS
+from eddies.scene.terms import PRESETS, TERMS, StepUnits
 from eddies.spectral.interpolation import SplineInterpolation
 from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid
+from eddies.workflows.learned.model import particles_for
 
 WARM_UP, STEPS, INTEGRATOR, NEIGHBORS = 10, 6, "rk3", 60.0
 DAMPING = (0.0, 0.0, 0.01, 0.14, 1.0, 1.6)
@@ -83,26 +83,32 @@ class Run:
         # The slabs of particles and field have different boundaries.
         spline = SplineInterpolation(grid, "quintic", margin=2)
         columns["velocity"] = spline.at(spline.coefficients(modes), columns["position"])
-        self.particles = ParticleSet.from_numpy(columns)
-        flow = FlowUnits(ReferenceScales(filter_width=width, spacing=tracers.spacing, velocity=self.speed,
-                                         acceleration=self.speed / self.turnover, density_mean=1.0, density=1e-3,
-                                         sound_speed=10 * self.speed, viscosity=1e-3, kolmogorov_length=ETA / side),
-                         tracers.radius_of(NEIGHBORS), NEIGHBORS)
+        columns["density"] = np.ones(len(columns["id"]))
+        scales = ReferenceScales(filter_width=width, spacing=tracers.spacing, velocity=self.speed,
+                                 acceleration=self.speed / self.turnover, density_mean=1.0, density=1e-3,
+                                 density_rate=1e-3 / self.turnover, sound_speed=10 * self.speed, viscosity=1e-3,
+                                 kolmogorov_length=ETA / side)
+        radius = tracers.radius_of(NEIGHBORS)
         dtype, terms = getattr(torch, precision), PRESETS[model]
         settings = {word: TERMS[word](**chosen) for word, chosen in terms.items()}
-        built = build_model(settings, terms, flow).to(dtype)
-        built.terms["damping"].rates.copy_(torch.tensor(DAMPING))
-        if "pairs" in built.terms:
-            built.terms["pairs"].network.weights[-1].mul_(PAIR_SHARE)
+        built = build_model(settings, terms, FlowUnits(scales, radius, NEIGHBORS)).to(dtype)
+        if "damping" in built.terms:
+            built.terms["damping"].rates.copy_(torch.tensor(DAMPING))
+        for term in built.networks:
+            term.network.weights[-1].mul_(PAIR_SHARE)
+        self.particles = particles_for(built, columns, torch.device("cpu"))
         self.dynamics = ParticleDynamics(slab, built, 0.0, dtype)
         self.integrator = INTEGRATORS[INTEGRATOR](self.dynamics)
+        units = StepUnits(radius=radius, filter_width=width, sound_speed=scales.sound_speed, velocity=self.speed,
+                          scheme=self.integrator.scheme)
+        self.longest = min(each.longest_step(units) for each in settings.values())  # that the terms allow
+        self.highest = int(resolved_wavenumber(tracers.spacing, width, scales.kolmogorov_length))
 
     @property
     def step(self) -> float:
-        """The longest step that the flow allows."""
-        resolution = self.dynamics.resolution
-        highest = resolution.grid.resolved * 2 * math.pi / self.dynamics.box.length
-        return allowed_step(self.integrator.scheme.angle, highest, resolution.speed or self.speed)
+        """The longest step that the flow and the terms allow."""
+        speed = self.dynamics.resolution.speed if self.dynamics.resolution else 0.0
+        return min(self.longest, allowed_step(self.integrator.scheme.angle, self.highest, speed or self.speed))
 
     def advance(self) -> None:
         """Take a step."""
@@ -117,7 +123,9 @@ def measure(comm: MPI.Comm, run: Run) -> dict[str, object]:
             watch.wrap(owner, name, part)
     found: list[Counter] = []
     for number in range(WARM_UP + STEPS):
-        run.dynamics.evaluations, run.dynamics.resolution.solves = 0, []
+        run.dynamics.evaluations, solves = 0, []
+        if run.dynamics.resolution is not None:
+            run.dynamics.resolution.solves = solves
         comm.Barrier()
         watch.reset()
         watch.last = start = time.perf_counter()
@@ -126,19 +134,20 @@ def measure(comm: MPI.Comm, run: Run) -> dict[str, object]:
         seconds = Counter({part: comm.allreduce(watch.seconds[part], MPI.MAX) for part in (*PARTS, "the rest")})
         seconds["whole"] = comm.allreduce(time.perf_counter() - start, MPI.MAX)
         taken = Counter({name: value / run.dynamics.evaluations for name, value in seconds.items()})
-        taken["iterations"] = np.mean([solve[0] for solve in run.dynamics.resolution.solves])
+        if solves:
+            taken["iterations"] = np.mean([solve[0] for solve in solves])
         if number >= WARM_UP:
             found.append(taken)
     medians = {name: float(median(step[name] for step in found)) for name in found[0]}
     whole, evaluations = medians.pop("whole"), run.dynamics.evaluations * run.turnover / run.step
-    return {"seconds_per_evaluation": whole, "iterations": medians.pop("iterations"),
+    return {"seconds_per_evaluation": whole, "iterations": medians.pop("iterations", None),
             "evaluations_per_turnover": evaluations, "seconds_per_turnover": whole * evaluations, "parts": medians}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("side", nargs="?", type=int, default=64)
-    parser.add_argument("--model", choices=[name for name in PRESETS if "resolved" in name], default="resolved")
+    parser.add_argument("--model", choices=PRESETS, default="resolved")
     parser.add_argument("--threads", type=int, default=threads(), help="per rank; default OMP_NUM_THREADS")
     parser.add_argument("--precision", choices=("float32", "float64"), default="float32")
     options, comm = parser.parse_args(), MPI.COMM_WORLD

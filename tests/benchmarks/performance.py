@@ -6,7 +6,8 @@
 
 Runs other programs of this folder: `particle_step.py` on one rank, on one rank with two threads and on two ranks, and
 `step.py` for a grid of 1.5 cells per particle and direction, which the same filter would need. The bounds of pairs and
-splines are their arithmetic at the speed of a matrix product, that of transforms is FFTW alone.
+splines are their arithmetic at the speed of a matrix product, that of transforms is FFTW alone. `draw` also prints the
+table of seconds per evaluation. It leaves out models that the file does not hold.
 """
 
 import argparse
@@ -23,14 +24,15 @@ from mpi4py import MPI
 from step import best, transform_bounds
 
 from eddies.parallel.slab import SlabDecomposition
-from eddies.report.figures import MODEL, SECOND, THIRD, TRUTH, letter, panels, png, styled
+from eddies.report.figures import FOURTH, MODEL, SECOND, THIRD, TRUTH, letter, panels, png, styled
 from eddies.scene.scene import Scene, load_scene
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.variant_rows import processor
 
 HERE = Path(__file__).parent
-LAYOUTS, MODELS, SIDES = ((1, 1), (1, 2), (2, 1)), ("resolved", "resolved + pairs"), (16, 24, 32, 48, 64, 96)
+LAYOUTS, SIDES = ((1, 1), (1, 2), (2, 1)), (16, 24, 32, 48, 64, 96)
+MODELS = "resolved", "resolved + pairs", "paper"  # the second one is projected to more cores
 ALL_LAYOUTS = 64             # particles per side; larger ones run on two ranks only
 CELLS_A_PARTICLE = 1.5
 # Operations of the network 16-16 per pair: multiplications with additions; a tanh counts as eleven.
@@ -99,6 +101,23 @@ def draw(found: dict) -> bytes:
     return png(figure)
 
 
+def measured_models(found: dict) -> list[str]:
+    """The models of which a file holds measurements."""
+    return [model for model in MODELS if any(row["model"] == model for row in found["steps"])]
+
+
+def table(found: dict) -> str:
+    """Seconds per evaluation of each model as a table: a row for each number of particles, a column for each layout."""
+    models = measured_models(found)
+    lines = [["particles", *(f"`{model}`, {ranks} x {threads}" for model in models for ranks, threads in LAYOUTS)]]
+    lines.append(["---"] * len(lines[0]))
+    for side in dict.fromkeys(row["particles"] for row in found["steps"]):
+        known = {(row["model"], row["ranks"], row["threads"]): f"{row['seconds_per_evaluation']:.2g}"
+                 for row in found["steps"] if row["particles"] == side}
+        lines.append([f"{side}³", *(known.get((model, *layout), "") for model in models for layout in LAYOUTS)])
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
 def seconds_of(found: dict, model: str, ranks: int, threads: int) -> tuple[np.ndarray, np.ndarray]:
     """Particles per side and seconds per evaluation of a layout."""
     rows = [row for row in found["steps"] if (row["model"], row["ranks"], row["threads"]) == (model, ranks, threads)]
@@ -107,7 +126,7 @@ def seconds_of(found: dict, model: str, ranks: int, threads: int) -> tuple[np.nd
 
 def over_particles(axis: Axes, found: dict) -> None:
     """Seconds per evaluation on two ranks, with slopes."""
-    for model, colour in zip(MODELS, (TRUTH, MODEL)):
+    for model, colour in zip(measured_models(found), (TRUTH, MODEL, FOURTH)):
         side, seconds = seconds_of(found, model, 2, 1)
         slope = np.polyfit(np.log(side[2:] ** 3), np.log(seconds[2:]), 1)[0]
         axis.loglog(side**3, seconds, "o-", color=colour, label=f"{model}, slope {slope:.2f}")
@@ -170,7 +189,9 @@ def main() -> None:
     if options.action == "measure":
         options.results.write_text(json.dumps(measure(), indent=1) + "\n")
     else:
-        options.figure.write_bytes(draw(json.loads(options.results.read_text())))
+        found = json.loads(options.results.read_text())
+        print(table(found))
+        options.figure.write_bytes(draw(found))
 
 
 if __name__ == "__main__":

@@ -74,6 +74,24 @@ def test_the_newest_three_are_kept(comm, tmp_path):
 
 
 @pytest.mark.mpi(1, 2)
+def test_a_checkpoint_of_other_settings_or_with_damage_is_replaced(comm, tmp_path):
+    """The present state must not be lost. A checkpoint of this step and these settings holds it, and is kept."""
+    fill(comm, tmp_path, [5], "others")
+    directory = fill(comm, tmp_path, [5])
+    assert checkpoints_in(directory.path) == [(5, "settings")]
+    path = directory.path / "step-00000005.h5"
+    written = path.stat().st_mtime_ns
+    comm.Barrier()
+    directory.write(5, {"time": -1.0})
+    assert path.stat().st_mtime_ns == written and directory.newest()["time"] == 5 / 3
+    comm.Barrier()
+    if comm.rank == 0:
+        path.write_bytes(path.read_bytes()[:-100])
+    comm.Barrier()
+    assert fill(comm, tmp_path, [5]).newest()["time"] == 5 / 3
+
+
+@pytest.mark.mpi(1, 2)
 def test_which_checkpoints_are_used(comm, tmp_path, caplog, monkeypatch):
     """Checkpoints of other kernels are used with a warning. Leftovers, other names, and those of other settings and
     versions are removed."""

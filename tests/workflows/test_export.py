@@ -14,6 +14,7 @@ from eddies.io.trajectories import Trajectory
 from eddies.workflows import export
 from eddies.workflows.rollout.measured import open_rollout
 
+from tests.changed_product import changed
 from tests.vtk_reader import VtkFile
 from tests.workflows.synthetic_run import write_run
 
@@ -71,6 +72,31 @@ def test_every_series_of_a_run(comm, tmp_path):
                 compare(tmp_path / "vtkhdf" / f"{product}-{group}-{name}.vtkhdf", group, (
                     stored if product == "ground_truth" else measured.exported)[group][name])
     comm.Barrier()
+
+
+@pytest.mark.mpi(1)
+def test_all_series_of_a_run_from_tracks_have_the_units_of_the_file(comm, tmp_path):
+    """So they lie on each other, and on the fields of a reconstruction, which are stored in these units."""
+    unit, corner = 3.0, np.array([1.0, -2.0, 0.5])
+    write_run(comm, tmp_path, truth={"cells": 8}, total=100, frames=6)
+    with changed(tmp_path / "ground_truth.h5") as file:
+        file.create_group("tracks").attrs.update(length_unit=unit, corner=corner)
+        stored = {name: file[f"particles/tracers/{name}/value"][0] for name in ("position", "velocity", "density")}
+    with create_product(comm, tmp_path / "reconstruction.h5", "reconstruction", {}) as file:
+        FieldWriter(file, "reconstructed", 8, {"velocity": 3}).append(0.0, 0, {"velocity": np.ones((3, 8, 8, 8))})
+        file.create_group("about").attrs.update(length_unit=unit, corner=corner)
+    export.run(tmp_path, tmp_path / "vtkhdf", comm)
+    for name in ("ground_truth-fields-filtered", "rollout-fields-model", "reconstruction-fields-reconstructed"):
+        with h5py.File(tmp_path / f"vtkhdf/{name}.vtkhdf") as file:
+            root = file["VTKHDF"]
+            assert root.attrs["Spacing"] * root.attrs["WholeExtent"][1] == pytest.approx(2 * np.pi * unit)
+            assert np.array_equal(root.attrs["Origin"], -corner)
+            assert name[:3] != "rec" or (root["PointData/velocity"][()] == 1).all()
+    with h5py.File(tmp_path / "vtkhdf/ground_truth-particles-tracers.vtkhdf") as file:
+        root, rows = file["VTKHDF"], slice(100)
+        assert np.allclose(root["Points"][rows], unit * stored["position"] - corner)
+        assert np.allclose(root["PointData/velocity"][rows], unit * stored["velocity"])
+        assert np.array_equal(root["PointData/density"][rows], stored["density"])
 
 
 @pytest.mark.mpi(2)

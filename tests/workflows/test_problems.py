@@ -47,12 +47,27 @@ def test_built_in_scenes_have_no_problem_but_missing_runs(comm, name):
     if name == "cbc":  # its truth is an experiment
         others = [line for line in others if "cannot be compared" not in line]
     assert all("no such file" in line for line in refused) and all("path" in line or "train" in line for line in others)
+    assert not any("this very flow" in line for line in others), "rollouts start outside the training"
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("name, changes, variants", [
+    ("tiny", ["simulation.start=0.2"], "paper, resolved, local"),
+    ("tiny", ["realisations=[5]", "initial.kind=taylor-green", "initial.peak_wavenumber=3.0"],
+     "paper, resolved, local"),
+    ("tiny", ["seed=99", "realisations=[1]", "variant.resolved.model.path=eddies:tiny"], "resolved")])
+def test_a_rollout_within_the_training_of_its_model_is_named(comm, name, changes, variants):
+    """Also on a realisation that is the flow of the training, with weights of this job or of the package. Coarse grids
+    learn nothing."""
+    found = [line for line in problems_of(load_scene(name, changes), comm)[1] if "this very flow" in line]
+    assert len(found) == 1 and found[0].startswith(f"variant {variants}: "), found
 
 
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("given, words, remedy", [
     ("flow.viscosity=0.05", "k_max eta is about 0.88", "flow.viscosity={viscosity to}"),
     ("flow.viscosity=0.05", "[flow] cells = 24", "flow.cells={raise cells to}"),
+    ("flow.viscosity=0", "the flow has no stationary state, and k_max eta", "flow.viscosity={raise viscosity to}"),
     ("flow.cells=120", "k_max eta is about 5.6", "flow.cells={lower cells to}"),
     ("flow.sound_speed=4", "Mach number is about 0.47: above 0.3", "flow.sound_speed={raise sound_speed to}"),
     ("flow.sound_speed=1.5", "supersonic", "flow.sound_speed={raise sound_speed to}"),

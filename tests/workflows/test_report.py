@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import h5py
 import pytest
@@ -15,7 +16,10 @@ from eddies.parallel.stop import Stopped
 from eddies.scene.scene import load_scene
 from eddies.workflows import dns, report
 from eddies.workflows.rollout.measured import open_rollout
+from eddies.workflows.run_directory.fingerprints import stage_provenance
+from eddies.workflows.status import status_lines
 from tests.changed_product import changed
+from tests.small_scene import one_model
 from tests.workflows.stopping import StopAtStep
 from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_model, write_rollout, write_run
 from tests.workflows.test_variant_rows import REALISED, scene_of
@@ -97,7 +101,7 @@ def test_a_page_of_a_variant_has_all_numbers_and_fewer_figures(comm, tmp_path):
     pages = []
     for directory in (tmp_path, tmp_path / "variant"):
         with open_rollout(directory, comm) as measured:
-            pages.append(report.read_page(directory, comm, measured, {}, main=directory == tmp_path).sections)
+            pages.append(report.read_page(directory, comm, measured, {}, {}, main=directory == tmp_path).sections)
     whole, own = ({section.key: section for section in page} for page in pages)
     assert list(own) == ["verdict", "rollout", "model", "cost"]
     for key in ("rollout", "model"):
@@ -307,6 +311,19 @@ def test_tracers_of_the_whole_flow_are_described_as_such(comm, tmp_path, section
 
 
 @pytest.mark.usefixtures("no_figures")
+def test_a_flow_without_dissipation_has_no_resolution(comm, tmp_path):
+    """Its Kolmogorov length is stored as 0, which is no measure of the grid."""
+    write_ground_truth(comm, tmp_path)
+    with changed(tmp_path / "ground_truth.h5") as file:
+        file["statistics/kmax_eta"][...] = 0.0
+        file["reference"].attrs.update(kolmogorov_length=0.0, kmax_eta=0.0)
+    report.run(tmp_path, comm)
+    metrics, page = written(tmp_path)
+    assert metrics["ground_truth"]["kmax_eta"] is None and "there is no smallest scale to resolve" in page
+    assert "η = 0" not in page and metrics["ground_truth"]["reynolds_lambda"] > 0
+
+
+@pytest.mark.usefixtures("no_figures")
 def test_a_rollout_without_its_ground_truth(comm, tmp_path):
     write_rollout(comm, tmp_path)
     report.run(tmp_path, comm)
@@ -368,6 +385,45 @@ def test_products_that_were_made_from_another_ground_truth_are_named_at_the_top(
     assert "not compared with the truth: rollout.h5 was made from another ground_truth.h5 than the one here" in page
     write_run(comm, tmp_path)
     assert warnings_of(tmp_path, capfd) == []
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_a_rollout_of_other_settings_is_left_out_of_the_comparison(comm, tmp_path, capfd):
+    """`eddies status` knows the same. The main page is on a variant that can be compared."""
+    scene = scene_of(tmp_path, ("free", 'simulation.method = "none"'))
+    (tmp_path / "scene.toml").write_text(scene.to_toml())
+    write_ground_truth(comm, tmp_path)
+    before = replace(scene.variant["plain"], simulation=replace(scene.variant["plain"].simulation, start=0.1))
+    for name, own in (("plain", before), ("free", scene.variant["free"])):
+        write_run(comm, tmp_path / name)
+        with changed(tmp_path / name / "rollout.h5") as file:
+            origin = json.loads(file.attrs["provenance"]) | stage_provenance(own, "simulate") | {"made_from": {}}
+            file.attrs["provenance"] = json.dumps(origin)
+            file["rollout"].attrs.update(seconds_per_step_low=0.03, seconds_per_step_high=0.04)
+    said, = [sentence for sentence in warnings_of(tmp_path, capfd) if sentence.startswith("plain: ")]
+    words = "made with other settings (simulation.start = 0.1, now absent)"
+    assert said.startswith("plain: rollout.h5 (made 20") and words in said
+    rows = {row["name"]: row for row in json.loads((tmp_path / "report/variants.json").read_text())["rows"]}
+    assert rows["plain"]["status"] == f"left out, because its rollout was {words}"
+    assert rows["plain"]["velocity_error_end"] is rows["plain"]["wall_seconds"] is None
+    assert rows["free"]["status"] == "complete" and rows["free"]["velocity_error_end"] > 0
+    metrics, page = written(tmp_path)
+    assert set(metrics["variants"]["plain"].values()) == {None} and f"left out, because its rollout was {words}" in page
+    assert "../plain/report/index.html" in page and "../free/report/index.html" not in page
+    assert any(words in sentence for sentence in written(tmp_path / "plain")[0]["warnings"])
+    assert any(line.strip().startswith("plain: simulate") and words in line for line in status_lines(tmp_path))
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_a_rollout_within_the_training_of_its_model_is_named_at_the_top(comm, tmp_path, capfd):
+    write_run(comm, tmp_path)
+    scene = one_model("tiny", ["simulation.start=0.1"])
+    for kind in ("model", "rollout"):
+        with changed(tmp_path / f"{kind}.h5") as file:
+            origin = json.loads(file.attrs["provenance"])
+            file.attrs["provenance"] = json.dumps(origin | {"scene": scene.to_toml()})
+    said, = warnings_of(tmp_path, capfd)
+    assert said.startswith("rollout.h5 (made 20") and "trained on this very flow up to 0.3 turnovers" in said
 
 
 @pytest.mark.usefixtures("no_figures")

@@ -101,7 +101,8 @@ class CheckpointDirectory:
 
         `state` holds, by name, `Block`s of arrays, whole arrays, and values for JSON. Whole arrays and values are taken
         from rank 0; those of other ranks, such as measured times, may differ. `files` are names of closed files of the
-        directory that belong to the checkpoint.
+        directory that belong to the checkpoint. An undamaged checkpoint of this step and these settings is kept, and
+        any other one of this step is replaced.
         """
         path = self.path / f"step-{step:08d}.h5"
         arrays = {name: part for name, part in state.items() if isinstance(part, np.ndarray | Block)}
@@ -113,7 +114,7 @@ class CheckpointDirectory:
                                "computed_by": _computed_by(), "values": values,
                                "files": {name: table_checksum(self.path / name) for name in files}})
 
-        if on_first_rank(self.comm, path.exists):
+        if on_first_rank(self.comm, path.exists) and self._complaint(path) is None:
             return
         try:
             plain = in_files(self.comm, path, begin)

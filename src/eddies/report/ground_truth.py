@@ -54,11 +54,19 @@ def section(statistics: Table, spectra: Table, reference: Mapping[str, float], p
     """
     released, times = reference.get("released_at"), statistics["time"]
     row = -1 if released is None else int(np.argmin(np.abs(times - released)))
+    # Without dissipation there is no Kolmogorov length, which is stored as 0.
+    statistics = {name: np.where(values > 0, values, np.nan) if name == "kmax_eta" else values
+                  for name, values in statistics.items()}
+    eta = reference["kolmogorov_length"]
     at = {name: float(values[row]) for name, values in statistics.items()} | dict(reference)
+    if eta == 0:
+        at["kmax_eta"] = None
+    reasons = {"mach_turbulent": "an incompressible fluid has none",
+               "kmax_eta": "nothing is dissipated, so there is no smallest scale to resolve"}
     when = "at the end" if released is None else "at the release of the tracers"
     shown = Section(
         "ground_truth", "Ground truth", f"{source} Numbers {when}, t = {at['time']:.3g}.",
-        metrics=[Metric(key, label, at.get(key), "an incompressible fluid has none")
+        metrics=[Metric(key, label, at.get(key), reasons.get(key, ""))
                  for key, label in METRICS.items() if key in at or key == "mach_turbulent"],
         main=("reynolds_lambda", "kmax_eta", "mach_turbulent"))
     shown.add_figure(
@@ -67,7 +75,7 @@ def section(statistics: Table, spectra: Table, reference: Mapping[str, float], p
         f"{at['dissipation_rate']:.3g}.")
     frame = -1 if released is None else int(np.argmin(np.abs(spectra["time"])))
     energy, filtered, width = spectra["energy"][frame], None, reference.get("filter_width")
-    caption = f"At t = {times[row]:.3g}; η = {reference['kolmogorov_length']:.3g}."
+    caption = f"At t = {times[row]:.3g}" + (f"; η = {eta:.3g}." if eta > 0 else ".")
     if "filtered" in spectra:
         filtered = spectra["filtered"][frame]
         caption += (f" The filter of width d = {width:.3g} keeps {filtered.sum() / energy.sum():.1%} of the energy. "

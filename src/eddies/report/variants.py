@@ -71,10 +71,13 @@ class ErrorAgainstTime:
     def summary(self) -> list[str]:
         """Sentences on where the subject is worth its cost, and on the cheapest grid that is at least as accurate.
 
-        A variant that became unstable counts as one without numbers.
+        A variant that became unstable counts as one without numbers. There are no sentences if the subject has no
+        rollout to compare.
         """
         numbers = [row if is_stable(row) else {**row, **dict.fromkeys(self.drawn)} for row in self.rows]
         subject = next(row for row in numbers if row["name"] == self.subject)
+        if not is_stable(subject) and subject["stopped_at"] is None:
+            return []
         others = [row for row in numbers if row is not subject]
         sentences = verdict(subject, others, {key: MEASURES[key] for key in self.drawn})
         grids = [row for row in others if row["on_grid"] and is_stable(row)]

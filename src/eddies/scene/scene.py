@@ -22,7 +22,8 @@ from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, NEIGHBORS, Euleri
 from eddies.scene.values import (SceneError, Section, choice, import_paths, integer, integers, key_name, read_section,
                                  section, sections, text, write_section)
 
-__all__ = ["BOX_LENGTH", "REALISATION", "Scene", "SceneError", "builtin_scenes", "load_scene", "Eulerian", "Flow",
+__all__ = ["BOX_LENGTH", "REALISATION", "Scene", "SceneError", "builtin_scenes", "load_scene", "stored_scene",
+           "Eulerian", "Flow",
            "Forcing", "Horizons", "Initial", "Kernel", "Model", "Reconstruction", "Simulation", "SpinUp", "Time",
            "Tracers", "Tracks", "Training"]
 
@@ -372,6 +373,14 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = (), removals
     except SceneError as error:
         option = ", --set" if error.key in given.keys else ", --unset" if error.key in removals else ""
         raise SceneError(f"{path}{option}: {error}", error.key) from None
+
+
+def stored_scene(written: str) -> Scene | None:
+    """Return the scene that a product stores as TOML; None if this version cannot read it, or lacks a class of it."""
+    try:
+        return read_section(Scene, tomllib.loads(written), others=(*FILE_ONLY_KEYS, VARIANT))
+    except (SceneError, ValueError):
+        return None
 
 
 def _tables_of_variants(document: dict[str, Any]) -> dict[str, dict[str, Any]]:

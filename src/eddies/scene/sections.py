@@ -71,6 +71,7 @@ class InitialFlow:
     turbulent: bool = False  # whether it has many scales; its spectrum then has its peak at `peak_wavenumber`
     sound: bool = False  # whether it is at rest except for sound waves
     steady: bool = False  # whether it has no acceleration without viscosity
+    seeded: bool = True  # whether it depends on the seed of the scene
 
     @property
     def from_file(self) -> bool:
@@ -80,11 +81,11 @@ class InitialFlow:
 
 INITIAL_FLOWS = {
     "random": InitialFlow(("amplitude", "peak_wavenumber"), rms=math.sqrt(3), turbulent=True),
-    "taylor-green": InitialFlow(("amplitude",), rms=0.5, peak=1.0),
-    "abc": InitialFlow(("amplitude", "wavenumber"), rms=math.sqrt(3), peak=3 * math.sqrt(2)),
-    "shear-wave": InitialFlow(("amplitude", "wavenumber"), rms=math.sqrt(0.5), peak=1.0, steady=True),
-    "sound-wave": InitialFlow(("amplitude", "wavenumber"), sound=True),
-    "file": InitialFlow(("path", "state")),
+    "taylor-green": InitialFlow(("amplitude",), rms=0.5, peak=1.0, seeded=False),
+    "abc": InitialFlow(("amplitude", "wavenumber"), rms=math.sqrt(3), peak=3 * math.sqrt(2), seeded=False),
+    "shear-wave": InitialFlow(("amplitude", "wavenumber"), rms=math.sqrt(0.5), peak=1.0, steady=True, seeded=False),
+    "sound-wave": InitialFlow(("amplitude", "wavenumber"), sound=True, seeded=False),
+    "file": InitialFlow(("path", "state"), seeded=False),
     "spectrum": InitialFlow(("path",)),
 }
 

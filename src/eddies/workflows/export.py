@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import ProductError, in_files, open_product
 from eddies.io.lagrangebench import shortcoming, write_dataset
-from eddies.io.provenance import read_provenance
+from eddies.io.provenance import product_attributes, read_provenance
 from eddies.io.trajectories import Trajectory
 from eddies.io.vtkhdf import write_images, write_points
 from eddies.parallel.communicator import Comm
@@ -22,6 +23,7 @@ from eddies.scene.sections import BOX_LENGTH
 log = logging.getLogger("eddies")
 
 PRODUCTS = ("ground_truth", "reconstruction", "rollout")
+WITH_LENGTH = "position", "velocity", "acceleration"  # the columns and variables that are proportional to a length
 Provenance = Mapping[str, Any]
 Series = Mapping[str, Mapping[str, Any]]  # by group ("fields" or "particles") and name
 
@@ -29,7 +31,8 @@ Series = Mapping[str, Mapping[str, Any]]  # by group ("fields" or "particles") a
 def run(run_directory: Path, output: Path, comm: Comm, layout: str = "vtkhdf") -> None:
     """Write every series of a run directory; all ranks call it.
 
-    In the layout "vtkhdf" a series is the file OUTPUT/PRODUCT-GROUP-NAME.vtkhdf, where GROUP is fields or particles.
+    In the layout "vtkhdf" a series is the file OUTPUT/PRODUCT-GROUP-NAME.vtkhdf, where GROUP is fields or particles. In
+    a run from measured tracks, all lengths are then in the unit and the axes of the file with the tracks.
     In the layout "lagrangebench" a series of particles is the directory OUTPUT/PRODUCT-particles-NAME.
 
     Raises:
@@ -43,13 +46,19 @@ def run(run_directory: Path, output: Path, comm: Comm, layout: str = "vtkhdf") -
 
 
 def _export(run_directory: Path, output: Path, alone: Comm, layout: str) -> None:
-    written = 0
+    written, unit, corner = 0, 1.0, np.zeros(3)
+    if layout == "vtkhdf":
+        unit, corner = _file_units(run_directory)
     for kind in PRODUCTS:
         if (run_directory / f"{kind}.h5").exists():
             with _opened(kind, run_directory, alone) as (series, provenance):
                 for group, name in ((group, name) for group in series for name in series[group]):
                     case = f"{kind}-{group}-{name}"
-                    written += _write(output, case, group, series[group][name], provenance, layout == "lagrangebench")
+                    one = series[group][name]
+                    if kind != "reconstruction":  # which has the units of the tracks already
+                        one = InFileUnits(one, unit, corner)
+                    written += _write(output, case, group, one, provenance, layout == "lagrangebench",
+                                      (unit * BOX_LENGTH, -corner))
     if not written:
         what, scene = (("particles that make a data set", " with a scene that has [tracers]")
                        if layout == "lagrangebench" else ("fields or particles", ""))
@@ -71,17 +80,41 @@ def _opened(kind: str, run_directory: Path, alone: Comm) -> Iterator[tuple[Serie
                    for group, reader in (("fields", FieldSeries), ("particles", Trajectory))}, read_provenance(file)
 
 
-def _cube_of(series: Any) -> tuple[float, np.ndarray]:
-    """Return the edge and the lower corner of the cube. For fields reconstructed from tracks, both are in the unit and
-    the axes of the tracks."""
-    if isinstance(series, FieldSeries) and "about" in series.file:
-        about = series.file["about"].attrs
-        return BOX_LENGTH * float(about["length_unit"]), -about["corner"]
-    return BOX_LENGTH, np.zeros(3)
+@dataclass(frozen=True)
+class InFileUnits:
+    """A series with lengths in another unit, and positions from another origin.
+
+    unit : the unit of length of the series, in the new one. corner : position (3,) of the new origin, in the new unit.
+    """
+
+    series: Any
+    unit: float
+    corner: np.ndarray
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.series, name)
+
+    def read(self, frame: int, column: str, *rows: int) -> np.ndarray:
+        """Read a column or variable as the series does."""
+        values = self.series.read(frame, column, *rows)
+        if column not in WITH_LENGTH:
+            return values
+        shift = self.corner if column == "position" else 0.0
+        return (values * self.unit - shift).astype(values.dtype)
 
 
-def _write(output: Path, case: str, group: str, series: Any, provenance: Provenance, data_set: bool) -> bool:
+def _file_units(run_directory: Path) -> tuple[float, np.ndarray]:
+    """Return the run's unit of length in that of the file with the tracks, and the place (3,) of the file's origin in
+    the cube; 1 and zeros for a run without tracks."""
+    found = (product_attributes(run_directory / "ground_truth.h5", "tracks")
+             or product_attributes(run_directory / "reconstruction.h5", "about"))
+    return float(found.get("length_unit", 1.0)), np.asarray(found.get("corner", np.zeros(3)))
+
+
+def _write(output: Path, case: str, group: str, series: Any, provenance: Provenance, data_set: bool,
+           cube: tuple[float, np.ndarray]) -> bool:
     """Write the series with the name `case` as a VTKHDF file or, if `data_set`, particles as a LagrangeBench data set.
+    `cube` holds the edge and the lower corner of the cube.
 
     Returns whether it was written.
     """
@@ -101,7 +134,7 @@ def _write(output: Path, case: str, group: str, series: Any, provenance: Provena
     if data_set:
         write_dataset(path, series, case, provenance)
     elif group == "fields":
-        write_images(path, series, *_cube_of(series), provenance)
+        write_images(path, series, *cube, provenance)
     else:
         write_points(path, series, provenance)
     log.info("export: %s, %d frames", path, len(series.times))

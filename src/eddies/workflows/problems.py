@@ -9,14 +9,17 @@ import math
 import os
 import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from eddies.clock import SAME
 from eddies.errors import UserError
+from eddies.import_path import is_path
 from eddies.flow.stability import REMEDIES, limits_of_step
 from eddies.io.hdf5 import open_product
 from eddies.io.new_files import LARGEST_BYTES, REMEDY, has_single_writer
+from eddies.io.provenance import product_provenance
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm, node_ranks
@@ -26,11 +29,12 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import (BOX_LENGTH, Flow, Forcing, Initial, Model, Reconstruction, Scene, SceneError,
                                 Simulation, Time, Tracers, Tracks, Training)
 from eddies.scene.terms import StepUnits
-from eddies.workflows.foreseen.numbers import Estimates, Turbulence, estimate
+from eddies.workflows.foreseen.numbers import Estimates, Turbulence, estimate, expected_turbulence
 from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
 from eddies.workflows.foreseen.storage import Storage, in_units, most_disk, storage
 from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.ground_truth.scene_flow import given_spectrum, stored_states
+from eddies.workflows.learned.seen import seen_by, seen_flows, start_within_training
 from eddies.workflows.learned.source import ModelDefinition, read_source
 from eddies.workflows.variants import Step
 
@@ -67,6 +71,7 @@ def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = 
     refused: dict[str, None] = {}
     doubts: dict[str, list[str]] = {}
     needs: list[Storage] = []
+    learned: dict[Path, dict[str, float]] = {}  # the flows that each model of the planned steps has seen
     for step in planned:
         own, stages = step.scene, step.stages
         refused |= dict.fromkeys(f"{own.name}: {problem}" for problem in _infeasible(step, comm, made))
@@ -77,7 +82,8 @@ def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = 
             own.initial if "dns" in stages and own.tracks is None else None,
             ModelDefinition.of(own) if given else None, own.name,
             own.device if {"train", "simulate"} & {*stages} else "cpu", comm))
-        for doubt in _warnings(step, made):
+        within = on_first_rank(comm, partial(_start_within_training, step, learned))
+        for doubt in (*_warnings(step, made), *within):
             doubts.setdefault(doubt, []).append(step.variant or "")
         for stage in stages:
             needs.append(storage(own, stage, comm.size))
@@ -88,6 +94,10 @@ def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = 
     if scene.sets and scene.kernel is not None and not scene.variant:
         doubts[f"[tracers] set: is absent, so that only the ground truths of {', '.join(scene.sets)} are made; "
                "choose one of them for kernel, model and rollout"] = []
+    initial = scene.initial
+    if scene.realisations and not initial.flow.seeded and not initial.flow.from_file:
+        doubts[f'realisations: [initial] kind = "{initial.kind}" does not depend on the seed, so all realisations are '
+               "the same flow, with other places of the particles; choose another kind, or remove realisations"] = []
     if needed > free_disk:
         doubts[f"the stages need about {in_units(needed)} of disk, and {in_units(free_disk)} are free here; "
                "choose another --output, or raise [tracers] frame_interval or field_every"] = []
@@ -245,6 +255,7 @@ def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
     scene, stages, expected = step.scene, step.stages, estimate(step.scene)
     tracers, model, training, simulation = scene.tracers, scene.model, scene.own_training, scene.simulation
     if "dns" in stages and scene.tracks is None:
+        yield from inviscid_turbulence(scene.flow, scene.initial, scene.forcing)
         if expected.turbulence is not None:
             yield from resolution(scene.flow, expected.turbulence)
             yield from laminar_flow(scene.flow, expected.turbulence)
@@ -266,6 +277,35 @@ def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
     if "train" in stages and model.path and model.weights_file not in made and not model.weights_file.is_file():
         yield (f'[model] path = "{model.path}": `eddies train` needs {model.weights_file}, which does not exist yet; '
                "train that model first, or give another path")
+
+
+def _start_within_training(step: Step, learned: dict[Path, dict[str, float]]) -> list[str]:
+    """Return a warning, in a list, if the rollout of a step starts within the training of its model. `learned` maps the
+    model files of earlier steps to the flows that these models have seen; that of this step is added."""
+    scene, directory = step.scene, step.links.get("dns", step.directory)
+    if scene.model is None or not {"train", "simulate"} & {*step.stages}:
+        return []
+    weights = scene.model.weights_file
+    if weights is None:
+        seen = seen_flows(scene, directory)
+    else:
+        seen = learned[weights] if weights in learned else seen_by(product_provenance(weights), weights.parent)
+    learned[step.directory / STAGES["train"].file] = seen
+    found = start_within_training(scene, directory, seen) if "simulate" in step.stages else None
+    return [] if found is None else [found]
+
+
+def inviscid_turbulence(flow: Flow, initial: Initial, forcing: Forcing | None) -> Iterator[str]:
+    """Yield a warning if nothing dissipates the energy of a turbulent or forced flow."""
+    forced = forcing is not None and forcing.injection_rate > 0
+    if flow.viscosity > 0 or is_path(flow.fluid) or not (forced or initial.flow.turbulent):
+        return
+    viscosity = (KMAX_ETA[0] / flow.largest_wavenumber) ** (4 / 3) * (
+        expected_turbulence(replace(flow, viscosity=1.0), initial, forcing).dissipation_rate ** (1 / 3))
+    fate = ("the energy of [forcing] is never dissipated, so the flow has no stationary state" if forced else
+            "no energy is dissipated, so it gathers at the smallest scales of the grid")
+    yield (f"[flow] viscosity = 0: {fate}, and k_max eta, which tells whether a grid resolves the smallest scales, has "
+           f"no value; raise viscosity to {at_least(viscosity)}{', or remove [forcing]' if forced else ''}")
 
 
 def resolution(flow: Flow, turbulence: Turbulence) -> Iterator[str]:

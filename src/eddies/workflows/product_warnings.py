@@ -1,8 +1,10 @@
-"""Warnings of a report: products that do not belong together, and numbers that are not finite."""
+"""Warnings of a report: products that do not belong together or were made with other settings, and numbers that are not
+finite."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,14 +12,38 @@ import numpy as np
 from eddies.io.errors import remedy_for
 from eddies.io.hdf5 import File, read_attributes, stored_numbers
 from eddies.io.provenance import product_provenance
-from eddies.pipeline import MAKER_OF
-from eddies.workflows.run_directory.work import changed_settings, of_other_settings
+from eddies.pipeline import MAKER_OF, STAGES
+from eddies.scene.scene import Scene, stored_scene
+from eddies.workflows.learned.seen import seen_by, start_within_training
+from eddies.workflows.run_directory.work import changed_settings, differences, of_other_settings
+from eddies.workflows.variants import steps
 
 Provenance = Mapping[str, Any]
 
 # Columns of a training history with a number in every step. Other columns are NaN in steps that do not compute them.
 COLUMNS_OF_ALL_STEPS = "step", "phase", "seconds", "loss", "learning_rate", "gradient_norm"
 MOST_NAMED = 4  # largest number of places in a file that a warning names
+
+
+def doubts(directory: Path, provenance: Mapping[str, Provenance], old: Mapping[Path, Sequence[str]]) -> list[str]:
+    """Return a sentence on each reason to doubt the numbers of a run directory, as far as provenance tells.
+
+    `provenance` maps the kind of each product in the directory to the provenance of the product. `old` is the result
+    of `old_products`. A sentence begins with the name of a product's file.
+    """
+    found = [f"{_made(kind, origin)} was made with {of_other_settings(old[path])} than those of the last job; "
+             f"{remedy_for(kind, MAKER_OF[kind].file)}, or note that the report shows it as it was made"
+             for kind, origin in provenance.items() if (path := directory / MAKER_OF[kind].file) in old]
+    return [*found, *mixed_products(provenance), *changed_truths(provenance.get("model", {})),
+            *_start_within_training(directory, provenance)]
+
+
+def _start_within_training(directory: Path, provenance: Mapping[str, Provenance]) -> list[str]:
+    """Return a sentence, in a list, if the rollout starts within the training of the model beside it."""
+    model, rollout = provenance.get("model"), provenance.get("rollout")
+    scene = stored_scene(rollout.get("scene", "")) if model and rollout else None
+    found = scene and start_within_training(scene, directory, seen_by(model, directory))
+    return [f"{_made('rollout', rollout)}: {found}"] if found else []
 
 
 def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
@@ -35,6 +61,20 @@ def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
                        "restore the missing file")
             found.append(f"{_made(kind, origin)} was made from {named}: "
                          f"{remedy_for(kind, MAKER_OF[kind].file)}, or {or_else}")
+    return found
+
+
+def old_products(scene: Scene, directory: Path) -> dict[Path, list[str]]:
+    """Return the products of a run that were made with other settings than `scene`, the scene of its last job.
+
+    The result maps the path of each such product to the settings that differ, as `changed_settings`.
+    """
+    found = {}
+    for step in steps(scene, tuple(STAGES), directory):
+        for stage in [STAGES[name] for name in step.stages]:
+            origin = product_provenance(step.directory / stage.file)
+            if origin and (differing := differences(stage, origin, step.scene)) is not None:
+                found[step.directory / stage.file] = differing
     return found
 
 

@@ -26,7 +26,8 @@ from eddies.analysis.spectra import vorticity
 from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import File, ProductError, in_files, open_product, read_attributes, read_table
-from eddies.io.provenance import others_trained_on, product_attributes, read_json, read_provenance
+from eddies.io.provenance import (others_trained_on, product_attributes, product_provenance, read_json,
+                                  read_provenance)
 from eddies.io.trajectories import Trajectory
 from eddies.measures import finite
 from eddies.parallel.broadcast import on_all_ranks
@@ -39,7 +40,7 @@ from eddies.report import variants as table_of_variants
 from eddies.report.page import Metric, RunRecord, Section, shown, write_page
 from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.workflows.problems import directory_problems
-from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite
+from eddies.workflows.product_warnings import doubts, not_finite, old_products
 from eddies.workflows.run_directory.work import read_stage_seconds
 from eddies.workflows.variant_rows import (COLUMNS, ROLLOUT, add_break_even, machine, notes, numbers, rows_of,
                                            simulation_seconds)
@@ -103,6 +104,7 @@ class Report:
     scene_name: name of the scene. runs: directories of the rollouts of each variant, by name. pages: run directory of
     each variant that was run, by name; the main page comes first. If no variant has a rollout, there is one page, of
     the run directory itself, under the name "". output: directory of the reports; None: "report" in each directory.
+    old: products that were made with other settings than those of the last job, as `old_products`.
     """
 
     directory: Path
@@ -110,6 +112,7 @@ class Report:
     runs: Mapping[str, Sequence[Path]]
     pages: Mapping[str, Path]
     output: Path | None = None
+    old: Mapping[Path, Sequence[str]] = field(default_factory=dict)
 
     @property
     def main(self) -> str:
@@ -142,18 +145,21 @@ def _plan(directory: Path, chosen: Sequence[str] = (), output: Path | None = Non
     """Return the scene of a run directory and the pages to make. The scene is None if it cannot be read.
 
     The main page shows the first variant in the list `chosen` that was run. If none of them was run, it shows the first
-    variant of the scene that was run.
+    variant of the scene that was run with the settings of the scene or, if there is none, with others.
     """
-    scene, runs = None, {}
+    scene, runs, old = None, {}, {}
     with contextlib.suppress(SceneError):
         scene = load_scene(directory / "scene.toml")
     if scene is not None:
         scene.check_variants(chosen)
+        old = old_products(scene, directory)
         if scene.simulation is not None:
             runs = {name: [*scenes] for name, scenes in rollouts(scene, directory).items()}
     ran = {name: first for name, (first, *_) in runs.items() if _has_rollout(first)}
-    main = next((name for name in (*chosen, *ran) if name in ran), "")
-    return scene, Report(directory, scene.name if scene else "", runs, {main: ran.get(main, directory), **ran}, output)
+    present = [name for name, first in ran.items() if not old.get(first / ROLLOUT)]
+    main = next((name for name in (*chosen, *present, *ran) if name in ran), "")
+    return scene, Report(directory, scene.name if scene else "", runs, {main: ran.get(main, directory), **ran}, output,
+                         old)
 
 
 def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: StopRequest | None = None,
@@ -223,7 +229,7 @@ def _make(report: Report, comm: Comm, alone: Comm, stop: StopRequest,
         def make(name: str) -> None:
             if name in report.pages:
                 page = made[name] = read_page(report.pages[name], alone, next(iter(measured[name]), None), scanned,
-                                              main=name == report.main)
+                                              report.old, main=name == report.main)
                 if draw:
                     _draw(page.sections)
             if report.main and len(measured[name]) == len(report.runs[name]):
@@ -253,11 +259,12 @@ def _makers(names: Sequence[str], ranks: int) -> tuple[dict[str, int], dict[str,
 
 
 def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, scanned: dict[Path, str],
-              main: bool) -> Page:
+              old: Mapping[Path, Sequence[str]], main: bool) -> Page:
     """Read the products of a run directory and return its page. The figures are not drawn.
 
-    scanned: results of `not_finite` by file; new results are added. main: whether this is the main page, which shows
-    everything. Other pages have fewer figures, and no sections on products that are links to other directories.
+    scanned: results of `not_finite` by file; new results are added. old: see `Report`. main: whether this is the main
+    page, which shows everything. Other pages have fewer figures, and no sections on products that are links to other
+    directories.
     """
     page = Page(directory, read_stage_seconds(directory))
     readers = {
@@ -290,8 +297,7 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
     if not page.provenance:
         raise ProductError(f"{directory}: holds none of {', '.join(f'{kind}.h5' for kind in MAKER_OF)}; "
                            "run `eddies dns SCENE` first")
-    page.warnings = [*mixed_products(page.provenance), *changed_truths(page.provenance.get("model", {})),
-                     *page.not_finite]
+    page.warnings = [*doubts(directory, page.provenance, old), *page.not_finite]
     page.sections = verdict.arranged([*page.sections, _cost_section(page)], bool(page.warnings))
     return page
 
@@ -420,6 +426,7 @@ def _cost_section(page: Page) -> Section:
 def _compare(scene: Scene | None, report: Report, page: Page, found: Mapping[str, Sequence[Row]], ranks: int,
              alone: Comm) -> tuple[list[Section], dict[str, str]]:
     """Return the section on all variants, in a list, and the texts of variants.csv and variants.json, by file name.
+    Warnings about the rollouts of the other pages are added to those of the main page.
 
     Both results are empty if no variant was run. page: the main page. found: `numbers` of each variant's rollouts.
     ranks: the number of ranks of the job.
@@ -427,7 +434,11 @@ def _compare(scene: Scene | None, report: Report, page: Page, found: Mapping[str
     if not report.main:
         return [], {}
     variants = scene.variant or {scene.name: scene}
-    rows, another = rows_of(scene, report.runs, found, alone)
+    for where in [each for runs in report.runs.values() for each in runs if each != page.directory]:
+        beside = {kind: origin for kind in MAKER_OF if (origin := product_provenance(where / f"{kind}.h5"))}
+        page.warnings += [f"{where.relative_to(report.directory)}: {sentence}"
+                          for sentence in doubts(where, beside, report.old) if sentence.startswith(ROLLOUT)]
+    rows, another = rows_of(scene, report.runs, found, alone, report.old)
     repeating = [name for name, each in variants.items() if each.coarse_cells == each.flow.cells]
     simulation = simulation_seconds(rows, repeating, page.simulation_seconds)
     add_break_even(rows, simulation)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 
 from eddies.clock import duration
@@ -18,10 +17,10 @@ from eddies.io.run_lock import find_lock
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES, Stage
-from eddies.scene.scene import SceneError, load_scene
+from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.workflows.foreseen.storage import in_units
 from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, set_files, stage_fingerprint
-from eddies.workflows.run_directory.work import changed_settings, of_other_settings, stage_seconds
+from eddies.workflows.run_directory.work import differences, of_other_settings, stage_seconds
 from eddies.workflows.variants import steps
 
 SCENE, PAGE = "scene.toml", Path("report") / "index.html"
@@ -110,9 +109,8 @@ def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
         seconds, prefix = stage_seconds(step.directory), ""
         if step.directory != directory:
             prefix = f"{step.directory.relative_to(directory)}: "
-        own, text = partial(stage_fingerprint, step.scene), step.scene.to_toml()
         for name in [name for name in step.stages if name in step.scene.stages]:
-            state = stage_state(STAGES[name], step.directory, own(name), own(name, DURATION_KEYS.get(name, ())), text)
+            state = stage_state(STAGES[name], step.directory, step.scene)
             sets = set_files(step.scene) if name == "dns" else {}
             lacking = [path.parent.name for path, fingerprint in sets.items()
                        if product_fingerprint(step.directory / path) != fingerprint]
@@ -130,25 +128,21 @@ def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
         yield f"  {title:{width}}  {'' if seconds is None else duration(seconds):>12}  {state}".rstrip()
 
 
-def stage_state(stage: Stage, directory: Path, settings: str, continued: str, text: str) -> str:
-    """Describe in words the state of a stage in a directory.
-
-    `settings` is the fingerprint of the stage, `continued` is the fingerprint of checkpoints that it can continue, and
-    `text` is the scene as TOML.
-    """
+def stage_state(stage: Stage, directory: Path, scene: Scene) -> str:
+    """Describe in words the state of a stage of a scene in a directory."""
     product = directory / stage.file
     origin = product_provenance(product)
-    if origin.get("fingerprint") == settings:
+    differing = differences(stage, origin, scene)
+    if differing is None:
         return f"complete, {in_units(product.stat().st_size)}"
     try:
         checkpoints = checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
     except ProductError as error:
         return str(error)
     if checkpoints and origin.get("course") not in [fingerprint for _, fingerprint in checkpoints]:
+        continued = stage_fingerprint(scene, stage.name, DURATION_KEYS.get(stage.name, ()))
         fits = continued in [fingerprint for _, fingerprint in checkpoints]
         return f"stopped at step {checkpoints[0][0]}, {'can continue' if fits else 'with other settings'}"
     if product.is_file():
-        if not origin:
-            return "damaged, unfinished or of another version"
-        return "made with " + of_other_settings(changed_settings(stage, origin.get("scene"), text))
+        return f"made with {of_other_settings(differing)}" if origin else "damaged, unfinished or of another version"
     return "to do"

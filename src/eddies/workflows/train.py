@@ -18,6 +18,7 @@ from eddies.io.provenance import product_provenance
 from eddies.io.weights import StoredWeights, save_weights
 from eddies.io.new_files import write_files
 from eddies.learning.training import Training
+from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
@@ -27,6 +28,7 @@ from eddies.workflows.ground_truth.frame_counts import last_seen
 from eddies.workflows.ground_truth.truth import GroundTruth, open_truth
 from eddies.workflows.learned.a_priori import evaluate
 from eddies.workflows.learned.model import trained_model
+from eddies.workflows.learned.seen import seen_by, seen_flows
 from eddies.workflows.learned.source import ModelDefinition, read_source, trained_on
 from eddies.workflows.learned.training_data import model_for, training_data
 from eddies.workflows.learned.training_phases import feature_range, take_all_steps, training_phases
@@ -85,7 +87,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                     for path, truth in zip(settings.truth_files, truths)}
         provenance |= {"mach_turbulent": truth.reference.get("mach_turbulent"),
                        "truths": {path: product_provenance(path).get("id") for path in of_named},
-                       "mach_of_truths": of_named}
+                       "mach_of_truths": of_named, "seen": on_first_rank(comm, lambda: seen_flows(scene, directory))}
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}
     save_weights(comm, product, "model", description, weights, provenance, tables)
     guard.checkpoints.remove()
@@ -100,24 +102,25 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
              errors["acceleration_error"][-1], beside, errors["delay"][-1], since)
 
 
-def take_weights(source: StoredWeights, definition: ModelDefinition, seen: float, provenance: Mapping[str, Any],
+def take_weights(source: StoredWeights, definition: ModelDefinition, window: float, provenance: Mapping[str, Any],
                  truth: GroundTruth, product: Path) -> None:
     """Write model.h5 with the weights that [model] path names, without training; collective.
 
     Terms work in units of the flow (Eq. 4), so only the scales and the radius of interaction change to those of this
     flow. The tables and the cost of training are copied from `source`, but the a-priori tests are repeated on this
-    flow. If `source` has tests on the flow on which it was trained, they are kept as `source_a_priori`. `seen` is the
+    flow. If `source` has tests on the flow on which it was trained, they are kept as `source_a_priori`. `window` is the
     share of this ground truth that the training window covers.
     """
     comm = truth.decomposition.comm
     model = trained_model(definition, source, truth.scales, comm).to(truth.device).forced(truth.forcing)
     dtype = next((parameter.dtype for parameter in model.parameters()), torch.float64)
-    tables = evaluate(truth, model, last_seen(seen, len(truth.times)), dtype)
+    tables = evaluate(truth, model, last_seen(window, len(truth.times)), dtype)
     description = definition.describe(truth.scales) | {"coefficients": model.learned_coefficients}
     if "training" in source.description:
         description["training"] = source.description["training"]
     origin, own_errors = trained_on(source, definition.model.path)
-    provenance = {**provenance, "mach_turbulent": truth.reference.get("mach_turbulent"), "source": origin}
+    seen = on_first_rank(comm, lambda: seen_by(source.provenance, source.path.parent))
+    provenance = {**provenance, "mach_turbulent": truth.reference.get("mach_turbulent"), "source": origin, "seen": seen}
     kept = source.tables | ({"source_a_priori": own_errors} if own_errors else {})
     save_weights(comm, product, "model", description, source.weights, provenance, kept | tables)
     errors, beside = tables["a_priori"], []

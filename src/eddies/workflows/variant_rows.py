@@ -8,6 +8,7 @@ import platform
 from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene, Tracers
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
-from eddies.workflows.run_directory.work import FAILURE, read_found_step, step_path
+from eddies.workflows.run_directory.work import FAILURE, of_other_settings, read_found_step, step_path
 
 if TYPE_CHECKING:
     from eddies.workflows.rollout.measured import MeasuredRollout  # needs torch
@@ -43,7 +44,8 @@ MODEL, ROLLOUT = STAGES["train"].file, STAGES["simulate"].file
 
 
 def rows_of(scene: Scene, runs: Mapping[str, Sequence[Path]], measured: Mapping[str, Sequence[Mapping[str, Any]]],
-            alone: Comm) -> tuple[list[dict[str, Any]], list[str]]:
+            alone: Comm, old: Mapping[Path, Sequence[str]] = MappingProxyType({}),
+            ) -> tuple[list[dict[str, Any]], list[str]]:
     """Return the rows of the table, and the names of variants with another kernel.
 
     There is a row for each variant, or one row for a scene without variants. A row has the keys COLUMNS; a missing
@@ -52,7 +54,9 @@ def rows_of(scene: Scene, runs: Mapping[str, Sequence[Path]], measured: Mapping[
     variants, and are left out.
 
     runs: directories of each variant's rollouts. measured: `numbers` of all rollouts of each variant, without variants
-    for which a rollout is missing. Times are in turnovers T; `wall_seconds` and `core_seconds` are per turnover.
+    for which a rollout is missing. old: the products that were made with other settings, by path, with the settings
+    that differ. A variant with such a rollout has no numbers, because it cannot be compared with the others. Times are
+    in turnovers T; `wall_seconds` and `core_seconds` are per turnover.
     """
     kernel_of = partial(stage_fingerprint, stage="train-kernel")
     kernels = {name: kernel_of(variant) for name, variant in scene.variant.items()}
@@ -66,24 +70,27 @@ def rows_of(scene: Scene, runs: Mapping[str, Sequence[Path]], measured: Mapping[
         found |= {"name": name, "label": variant.label or name, "method": simulation.method, "kind": simulation.title,
                   "on_grid": simulation.on_grid,
                   "settings": "; ".join(scene.differences(name)) if scene.variant else ""}
-        if name in measured:
+        other = next((each for each in directories if old.get(each / ROLLOUT)), None)
+        if name in measured and other is None:
             step = step_path(simulation, first.parent if scene.realisations else first)
             found |= combined(measured[name])
             found |= before(first / MODEL if variant.needs_model else None, step, alone)
         else:
-            found["status"] = missing_reason(next(each for each in directories if not (each / ROLLOUT).exists()))
+            lacking = other or next(each for each in directories if not (each / ROLLOUT).exists())
+            found["status"] = missing_reason(lacking, old.get(lacking / ROLLOUT, ()))
         if name in different:
             found |= dict.fromkeys(THROUGH_KERNEL)
         rows.append({key: finite(value) for key, value in found.items()})
     return rows, different
 
 
-def missing_reason(directory: Path) -> str:
-    """Return why the run directory of a variant has no rollout."""
+def missing_reason(directory: Path, changes: Sequence[str] = ()) -> str:
+    """Return why the run directory of a variant has no rollout to compare. `changes` are the settings in which its
+    rollout differs from the scene."""
     for path in (directory / FAILURE, directory.parent / FAILURE):
         if path.is_file():
             return f"failed: {path.read_text(encoding='utf-8').strip()}"
-    return "not run"
+    return f"left out, because its rollout was made with {of_other_settings(changes)}" if changes else "not run"
 
 
 def combined(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from eddies.import_path import origins
 from eddies.pipeline import STAGES
-from eddies.scene.scene import Scene
+from eddies.scene.scene import Scene, Tracers
 from eddies.scene.sections import SET_KEYS
 from eddies.scene.values import import_paths
 
@@ -55,6 +55,18 @@ def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> 
     read = [[key, _without(settings[key], key, (*each.but, *without))]
             for each in STAGES.values() if each.name in of_these for key in each.reads]
     return hashlib.sha256(json.dumps(read).encode()).hexdigest()
+
+
+def flow_fingerprint(scene: Scene) -> str:
+    """Return the checksum of all that determines the flow of a ground truth after the release of its tracers.
+
+    Ground truths with the same checksum hold the same realisation, whatever their duration and their tracers. A seed
+    that the flow does not depend on does not count.
+    """
+    if scene.tracks is not None or not scene.initial.flow.seeded:
+        scene = replace(scene.without_variants, seed=0)
+    tracers = [f"tracers.{key.name}" for key in fields(Tracers) if key.name != "forced"]
+    return stage_fingerprint(scene, "dns", (*tracers, "time.duration"))
 
 
 def set_files(scene: Scene) -> dict[Path, str]:

@@ -191,6 +191,18 @@ def changed_settings(stage: Stage, then: str | None, now: str | None) -> list[st
             and any(key.partition(".")[0] in each.reads and key not in each.but for each in stages)]
 
 
+def differences(stage: Stage, origin: Mapping[str, Any], scene: Scene) -> list[str] | None:
+    """Return the settings in which a product of a stage differs from a scene, as `changed_settings`; None if it was
+    made with the settings of the scene.
+
+    `origin` is the provenance of the product. The list is empty if only the content of files differs, such as weights,
+    or if such a file is not found.
+    """
+    if origin.get("fingerprint") == stage_fingerprint(scene, stage.name):
+        return None
+    return changed_settings(stage, origin.get("scene"), scene.to_toml())
+
+
 def of_other_settings(changes: Sequence[str]) -> str:
     """Return the words "other settings", followed by the first few of `changes`."""
     listed = [*changes[:MOST_CHANGES], *(["..."] if changes[MOST_CHANGES:] else [])]
