@@ -409,6 +409,21 @@ fields = ["velocity", "gradient"]
 
 
 @pytest.mark.mpi(1)
+@pytest.mark.parametrize("factor, rows, words", [
+    (0.5, 30, "show more noise, 0.00"), (1.0, 30, None), (1e3, 30, "show less noise: the residuals of a parabola"),
+    (1.0, 3, "all tracks have three rows")])
+def test_a_noise_that_does_not_fit_gives_a_warning(comm, tmp_path, caplog, factor, rows, words):
+    draw, noise = np.random.default_rng(1), 1e-3
+    times = 0.01 * np.arange(rows)
+    swing = 0.2 * np.sin(8 * times[:, None] + 6 * draw.random(100))
+    position = 0.3 + 0.4 * draw.random((100, 3)) + swing[:, :, None]
+    write_tracks(tmp_path / "a.h5", np.repeat(times, 100), np.tile(np.arange(100), rows),
+                 (position + noise * draw.standard_normal(position.shape)).reshape(-1, 3), edge=1.0)
+    read_measured(scene_of(comm, tmp_path, f'[tracks]\npath = "a.h5"\nnoise = {factor * noise}\n').tracks)
+    assert [words in line for line in caplog.messages if "noise = " in line] == ([True] if words else [])
+
+
+@pytest.mark.mpi(1)
 def test_tracks_that_move_alike_teach_a_model_nothing(comm, tmp_path):
     uniform_tracks(comm, tmp_path, (1.0, 0.5, -0.2), True)
     scene = scene_of(comm, tmp_path, '[tracks]\npath = "uniform.h5"\nviscosity = 1e-3\n[model]\npreset = "resolved"\n'
