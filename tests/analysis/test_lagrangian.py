@@ -127,3 +127,19 @@ def test_tetrads_are_a_particle_and_its_three_nearest(spread):
     assert np.array_equal(near_tetrads(position, LENGTH), np.argsort(apart, axis=1)[:, :4].T)
     with pytest.raises(ValueError, match="3 particles"):
         near_tetrads(position[:3], LENGTH)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("together", [4, 3000])
+def test_particles_at_the_same_place_have_no_shape_and_spoil_no_mean(together, monkeypatch):
+    """Groups of four whose members stay together: one among others, or all particles. No warning reaches the user."""
+    places, moves = START.copy(), VELOCITY.copy()
+    for values in (places, moves):
+        values[:together] = values[:together:4].repeat(4, axis=0)
+    tetrads = np.concatenate([np.arange(together).reshape(-1, 4).T, TETRADS[:, :100 if together == 4 else 0]], axis=1)
+    monkeypatch.setitem(globals(), "START", places)
+    monkeypatch.setitem(globals(), "VELOCITY", moves)
+    found = path_statistics(Paths(), range(len(TIMES)), tetrads)
+    for values in (found.pair_dispersion, found.tetrad_size, found.tetrad_shape):
+        assert (np.isfinite(values) if together == 4 else np.isnan(values)).all()
+    assert together > 4 or found.tetrad_shape.sum(axis=1) == pytest.approx(np.ones(len(TIMES)))

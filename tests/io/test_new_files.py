@@ -312,3 +312,9 @@ def test_small_files_are_all_written_or_none(comm, tmp_path):
         assert sorted(tmp_path.iterdir()) == [data, page]
         assert page.read_text(encoding="utf-8") == "ä" and data.read_bytes() == b"\0\1"
         comm.Barrier()  # before rank 0 writes again
+
+
+@pytest.mark.mpi(1)
+def test_a_name_that_is_not_utf_8_is_escaped_in_a_text(comm, tmp_path):
+    write_files({tmp_path / "scene.toml": "directory: out\udcff, ä"})
+    assert (tmp_path / "scene.toml").read_text(encoding="utf-8") == "directory: out\\udcff, ä"

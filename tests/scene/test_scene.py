@@ -214,3 +214,19 @@ def test_the_schema_accepts_what_a_scene_may_hold(override, accepted):
     import tomllib
     jsonschema = pytest.importorskip("jsonschema")
     assert jsonschema.Draft202012Validator(json_schema()).is_valid(tomllib.loads(override)) is accepted
+
+
+def test_a_name_from_a_file_that_no_directory_can_have_names_the_file(tmp_path):
+    for name in ("my scene", "écoulement"):
+        text = scene_error(load_scene, scene_file(tmp_path, f'base = "{TINY}"\n', f"{name}.toml"))
+        assert f'name = "{name}": must be' in text and "rename the file, or add the key" in text
+        path = scene_file(tmp_path, f'base = "{TINY}"\nname = "own"\n', f"{name}.toml")
+        assert load_scene(path).name == "own"
+    given = scene_error(load_scene, path, ["name=../evil"])
+    assert "must be the name of a directory" in given and "rename the file" not in given
+
+
+def test_a_file_name_that_is_not_utf_8_is_refused_before_any_work():
+    """The scene of the run could not be written."""
+    text = scene_error(load_scene, TINY, ["model.path=runs/\udcff"])
+    assert '[model] path = "runs/\udcff"' in text and "UTF-8, but this is not; rename the file or directory" in text

@@ -15,6 +15,7 @@ from eddies.io.hdf5 import ProductError
 from eddies.parallel.stop import Stopped
 from eddies.scene.scene import load_scene
 from eddies.workflows import dns, report
+from eddies.workflows.product_warnings import old_products
 from eddies.workflows.rollout.measured import open_rollout
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 from eddies.workflows.status import status_lines
@@ -412,6 +413,27 @@ def test_a_rollout_of_other_settings_is_left_out_of_the_comparison(comm, tmp_pat
     assert "../plain/report/index.html" in page and "../free/report/index.html" not in page
     assert any(words in sentence for sentence in written(tmp_path / "plain")[0]["warnings"])
     assert any(line.strip().startswith("plain: simulate") and words in line for line in status_lines(tmp_path))
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_files_that_are_not_found_from_here_make_no_product_old(comm, tmp_path, monkeypatch):
+    """A stored scene may name them relative to another working directory."""
+    there, here = tmp_path / "there", tmp_path / "here"
+    for folder in (there, here):
+        folder.mkdir()
+    (there / "start.h5").write_text("state")
+    monkeypatch.chdir(there)
+    scene = one_model("tiny", ["initial.kind=file", "initial.path=start.h5"],
+                      ["initial.amplitude", "initial.peak_wavenumber"])
+    write_run(comm, tmp_path / "run")
+    (tmp_path / "run/scene.toml").write_text(scene.to_toml())
+    for product, stage in (("ground_truth", "dns"), ("rollout", "simulate")):
+        with changed(tmp_path / f"run/{product}.h5") as file:
+            origin = json.loads(file.attrs["provenance"]) | stage_provenance(scene, stage) | {"made_from": {}}
+            file.attrs["provenance"] = json.dumps(origin)
+    monkeypatch.chdir(here)
+    assert old_products(scene, tmp_path / "run").keys() == {tmp_path / "run/kernel.h5", tmp_path / "run/model.h5"}
+    assert any("not found from here" in line for line in status_lines(tmp_path / "run"))
 
 
 @pytest.mark.usefixtures("no_figures")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -156,23 +156,28 @@ def _dispersion(run: Frames, chosen: Sequence[int],
     for separation in paths:
         corners = np.concatenate([np.zeros((1, tetrads.shape[1], 3)), separation.reshape(CORNERS - 1, -1, 3)])
         start = corners[1] if start is None else start
-        pairs.append(np.sum((corners[1] - start) ** 2) / np.sum(start**2))
+        pairs.append(np.sum((corners[1] - start) ** 2))
         size, shape = tetrad_moments(corners)
         sizes.append(size.mean())
-        shapes.append(shape.mean(axis=0))
-    return np.array(pairs), np.array(sizes) / sizes[0], np.array(shapes)
+        shapes.append(shape[size > 0].mean(axis=0) if size.any() else np.full(3, np.nan))
+    return _over(pairs, np.sum(start**2)), _over(sizes, sizes[0]), np.array(shapes)
+
+
+def _over(values: Any, scale: Any) -> np.ndarray:
+    """Divide; the result is NaN where `scale` is 0, as for particles at the same place."""
+    return np.asarray(values) / np.where(scale > 0, scale, np.nan)
 
 
 def tetrad_moments(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the size R^2 (g,) and the shape (g, 3) of g tetrads from the positions `corners` (4, g, 3).
 
     The shape consists of the eigenvalues of sum (x_i - x)(x_i - x)^T, divided by R^2, the largest first. x is the mean
-    of the four positions x_i.
+    of the four positions x_i. It is NaN for particles at the same place.
     """
     offsets = corners - corners.mean(axis=0)
     eigenvalues = np.linalg.eigvalsh(np.einsum("cgi,cgj->gij", offsets, offsets))[:, ::-1]
     size = eigenvalues.sum(axis=1)
-    return size, eigenvalues / size[:, None]
+    return size, _over(eigenvalues, size[:, None])
 
 
 def correlation(initial: np.ndarray, later: np.ndarray) -> float:

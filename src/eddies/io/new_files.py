@@ -60,12 +60,14 @@ _abandoned: list[_NewFile] = []
 
 
 def write_files(contents: Mapping[Path, bytes | str]) -> None:
-    """Write small files on one rank. They get their names after all of them have been written.
+    """Write small files on one rank, texts in UTF-8. They get their names after all of them have been written.
 
+    A byte of a file name that is not UTF-8 is written into a text as an escape, such as "\\udcff".
     Raises WriteError if a file cannot be written or renamed. If one cannot be written, no existing file is changed.
     """
     partials = {path: path.with_name(path.name + ".partial") for path in contents}
-    whole = {path: content.encode() if isinstance(content, str) else content for path, content in contents.items()}
+    whole = {path: content.encode(errors="backslashreplace") if isinstance(content, str) else content
+             for path, content in contents.items()}
     total = sum(map(len, whole.values()))
     try:
         for path, partial in partials.items():

@@ -107,6 +107,10 @@ class Rule:
             return value
         if not isinstance(value, (str, os.PathLike)) or not os.fspath(value):
             raise ValueError
+        try:
+            os.fspath(value).encode()
+        except UnicodeEncodeError:  # from the name of a file or directory
+            raise ValueError("a scene is text in UTF-8, but this is not; rename the file or directory") from None
         return os.fspath(value)
 
     def _accept_number(self, value: Any) -> float | int:

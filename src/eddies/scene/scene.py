@@ -359,11 +359,12 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = (), removals
     path, document = read_document(str(name_or_path))
     search_in(path.parent)
     search_in(Path())
-    given = Layer({})
+    given, named = Layer({}), True
     try:
         given = command_line(overrides, removals)
         existing = [*_tables_of_variants(document)]
         given.apply(document)
+        named = "name" in document
         document.setdefault("name", path.stem)
         variants = {name: Layer.of_table(table) for name, table in _tables_of_variants(document).items()}
         document.pop(VARIANT, None)
@@ -372,7 +373,9 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = (), removals
         return replace(scene, variant={name: _variant(document, name, layer) for name, layer in variants.items()})
     except SceneError as error:
         option = ", --set" if error.key in given.keys else ", --unset" if error.key in removals else ""
-        raise SceneError(f"{path}{option}: {error}", error.key) from None
+        origin = "" if named or error.key != "name" else (
+            "; the name is that of the file, because the scene has no key name: rename the file, or add the key")
+        raise SceneError(f"{path}{option}: {error}{origin}", error.key) from None
 
 
 def stored_scene(written: str) -> Scene | None:

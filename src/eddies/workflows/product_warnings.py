@@ -67,13 +67,14 @@ def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
 def old_products(scene: Scene, directory: Path) -> dict[Path, list[str]]:
     """Return the products of a run that were made with other settings than `scene`, the scene of its last job.
 
-    The result maps the path of each such product to the settings that differ, as `changed_settings`.
+    The result maps the path of each such product to the settings that differ, as `changed_settings`. A product is left
+    out if only the content of files differs: these files may just not be found from the working directory.
     """
     found = {}
     for step in steps(scene, tuple(STAGES), directory):
         for stage in [STAGES[name] for name in step.stages]:
             origin = product_provenance(step.directory / stage.file)
-            if origin and (differing := differences(stage, origin, step.scene)) is not None:
+            if origin and (differing := differences(stage, origin, step.scene)):
                 found[step.directory / stage.file] = differing
     return found
 

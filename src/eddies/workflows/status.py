@@ -143,6 +143,9 @@ def stage_state(stage: Stage, directory: Path, scene: Scene) -> str:
         continued = stage_fingerprint(scene, stage.name, DURATION_KEYS.get(stage.name, ()))
         fits = continued in [fingerprint for _, fingerprint in checkpoints]
         return f"stopped at step {checkpoints[0][0]}, {'can continue' if fits else 'with other settings'}"
-    if product.is_file():
-        return f"made with {of_other_settings(differing)}" if origin else "damaged, unfinished or of another version"
-    return "to do"
+    if not product.is_file():
+        return "to do"
+    if not origin:
+        return "damaged, unfinished or of another version"
+    return f"made with {of_other_settings(differing)}" if differing else (
+        "made from files that the scene names, which have changed or are not found from here")
