@@ -9,10 +9,16 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import torch
 
+from eddies.io.weights import load_weights
+from eddies.learning.optimization import shared_values
 from eddies.scene.model import BUILT_IN_PREFIX, WEIGHTS, built_in_weights
 from eddies.scene.scene import load_scene
 from eddies.stored_run import open_run
+from eddies.workflows.ground_truth.truth import open_truth
+from eddies.workflows.learned.source import ModelDefinition
+from eddies.workflows.learned.training_data import training_data
 from tests.commands import run_cli
 from tests.left_out import leave_out_figures
 from tests.small_scene import TINY
@@ -190,3 +196,19 @@ def test_a_trained_model_runs_on_another_flow(comm, run_directory, tmp_path):
     assert metrics["warnings"] == []
     assert shown["acceleration_error"] < 0.95 and shown["source_acceleration_error"] < 0.9
     assert shown["mach_turbulent"] == pytest.approx(2 * shown["source_mach_turbulent"], rel=0.2)
+
+
+@pytest.mark.parametrize("preset, weights", [("paper", "hit-small-paper"), ("local", "hit-local"),
+                                             ("resolved", "tiny")])
+def test_the_losses_of_a_horizon_begin_within_a_factor_of_ten(comm, run_directory, preset, weights):
+    """Those of the velocity and of the energies, for trained models: neither hides the other."""
+    settings = ["training.horizons.frames=[2]", "training.horizons.steps=1", f"model.preset={preset}"]
+    stored = load_weights(comm, WEIGHTS / f"{weights}.h5", "model")
+    scene = load_scene("tiny", settings, ["variant"])
+    with open_truth(comm, run_directory / "ground_truth.h5") as truth:
+        [data] = training_data(ModelDefinition.of(scene), scene.training, [truth])
+        data.model.load_state_dict({name: torch.as_tensor(values) for name, values in stored.weights.items()})
+        trainer, window = data.rollout_trainer()
+        with torch.no_grad():
+            losses = shared_values(comm, trainer.loss_shares(window, 2))
+    assert 0.1 < losses["energy_loss"] / losses["rollout_loss"] < 10
