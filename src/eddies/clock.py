@@ -1,4 +1,4 @@
-"""Simulated time, equality of times, the ladder of step sizes (each half the previous one), and the progress line.
+"""Simulated time, the ladder of step sizes (each half the previous one), and the progress line.
 
 No unit of time is special, so round-off is compared with a duration or with an interval between times.
 """
@@ -12,8 +12,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-
-import numpy as np
 
 log = logging.getLogger("eddies")
 
@@ -72,17 +70,6 @@ class Clock:
         """Advance by one step of size `step`."""
         self.steps += 1
         self.elapsed += step
-
-
-def same_times(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows of `first` (m,) and of `second` (n,) that are at the same times, as two arrays of equal length.
-
-    Both are times in ascending order. Two times are the same if they differ by at most SAME times the shortest interval
-    in both, or, without an interval, SAME times the larger time.
-    """
-    intervals = [np.diff(times).min() for times in (first, second) if len(times) > 1]
-    gap = np.abs(np.subtract.outer(first, second))
-    return np.nonzero(gap <= SAME * min(intervals, default=np.abs([*first, *second]).max(initial=0.0)))
 
 
 def ladder_step(largest: float, bound: float) -> float:

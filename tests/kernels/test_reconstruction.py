@@ -40,7 +40,8 @@ def averages_by_torch(field, kernel):
     volume = with_ghosts(field.halo, 1 / at_particles.sum(kernel.value(at_particles.distance)[None])[0])
     on_grid, on_particles = (reconstruct_with_gradient(kernel, pairs, volume, field._velocity)
                              for pairs in (at_points, at_particles))
-    return [volume, on_grid[0], *on_grid, *on_particles]
+    velocities = [velocity + field._mean for velocity, _ in (on_grid, on_particles)]
+    return [volume, velocities[0], velocities[0], on_grid[1], velocities[1], on_particles[1]]
 
 
 @pytest.mark.mpi(1, 3)

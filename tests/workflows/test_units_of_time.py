@@ -12,7 +12,7 @@ from tests.workflows.small_rollout import scene_text
 # Powers of the unit of time in the numbers of a report. All others have no dimension.
 POWERS = {"energy": -2, "dissipation_rate": -3, "eddy_turnover_time": 1, "kolmogorov_time": 1, "velocity_rms": -1,
           "acceleration_rms": -2, "delay": 1, "time step": 1}
-OF_THE_COMPUTER = ("second", "(s)", "storing", "cheaper")
+OF_THE_COMPUTER = ("second", "(s)", "storing", "cheaper", "warnings")  # warnings name the time of a product
 
 
 def numbers(values, place=()):

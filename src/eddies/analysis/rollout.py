@@ -9,12 +9,23 @@ import numpy as np
 
 from eddies.analysis.spectra import band_ratios, spectrum_error
 from eddies.analysis.velocity_gradients import Invariants
-from eddies.clock import ROUND_OFF, same_times
+from eddies.clock import ROUND_OFF, SAME
 
 SHOWN = 3   # largest number of times at which a report shows spectra of a rollout
 PLANES = 4  # largest number of times at which a report shows planes of a rollout
 # Columns by name. A table of spectra has wavenumber (shells,), time (m,), energy (m, shells).
 Table = Mapping[str, np.ndarray]
+
+
+def same_times(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows of `first` (m,) and of `second` (n,) that are at the same times, as two arrays of equal length.
+
+    Both are times in ascending order. Two times are the same if they differ by at most SAME times the shortest interval
+    in both, or, without an interval, SAME times the larger time.
+    """
+    intervals = [np.diff(times).min() for times in (first, second) if len(times) > 1]
+    gap = np.abs(np.subtract.outer(first, second))
+    return np.nonzero(gap <= SAME * min(intervals, default=np.abs([*first, *second]).max(initial=0.0)))
 
 
 class Frames(Protocol):

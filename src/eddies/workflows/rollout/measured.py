@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from eddies.analysis.rollout import PLANES, Plane, Rollout
+from eddies.analysis.rollout import PLANES, Plane, Rollout, same_times
 from eddies.analysis.velocity_gradients import Invariants
-from eddies.clock import same_times
 from eddies.io.hdf5 import ProductError, open_product, read_attributes, read_table
 from eddies.io.provenance import read_provenance
 from eddies.io.trajectories import IMAGE, Trajectory
