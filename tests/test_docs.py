@@ -5,6 +5,8 @@ import dataclasses
 import json
 import re
 import shlex
+from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -269,6 +271,16 @@ def test_every_guarantee_names_tests_that_exist():
         assert named and len(named) == tests.count("`") / 2, guarantee
         for path, name in named:
             assert f"\ndef {name}(" in (CHECKOUT / "tests" / path).read_text(), f"{path}::{name}"
+
+
+def test_functions_of_the_equations_exist():
+    page = (CHECKOUT / "docs/structure.md").read_text()
+    named = re.findall(r"`(\S+)\.py`: (`[\w.]+`(?:, `[\w.]+`)*)", page)
+    assert len(named) > 15
+    for path, names in named:
+        module = import_module(f"eddies.{path.replace('/', '.')}")
+        for name in re.findall(r"[\w.]+", names):
+            assert attrgetter(name)(module), (path, name)
 
 
 def test_constants_of_the_resolved_velocity_are_those_of_the_code():

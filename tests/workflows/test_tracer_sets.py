@@ -100,23 +100,27 @@ def test_variants_of_one_set_are_measured_alike(tmp_path):
     assert rows_of(alike, {}, {}, None)[1] == [] and rows_of(apart, {}, {}, None)[1] == ["b"]
 
 
+def start(scene, directory):
+    return find_work(["dns"], scene, directory).courses["dns"].start
+
+
 @pytest.mark.mpi(1)
 def test_a_lost_ground_truth_of_a_set_is_made_again(comm, tmp_path):
     scene = load_scene(TINY, [*SPLIT, *SETS])
     dns.run(scene, comm, tmp_path)
-    assert find_work(["dns"], scene, tmp_path).done == {"dns"}
-    assert find_work(["dns"], scene.tracer_sets["few"], tmp_path / "few").done == {"dns"}
+    assert start(scene, tmp_path) == "skip"
+    assert start(scene.tracer_sets["few"], tmp_path / "few") == "skip"
     (tmp_path / "few" / "ground_truth.h5").unlink()
     (tmp_path / "whole" / "scene.toml").write_text("# of another scene")
     (tmp_path / "scene.toml").write_text(scene.to_toml())
     (line,) = [line for line in status_lines(tmp_path) if line.startswith("  dns")]
     assert line.endswith("lacks the ground truth of few")
-    work, kept = find_work(["dns"], scene, tmp_path), product_provenance(tmp_path / "whole" / "ground_truth.h5")
-    assert not work.done and not work.lost
+    kept = product_provenance(tmp_path / "whole" / "ground_truth.h5")
+    assert start(scene, tmp_path) == "anew" and not find_work(["dns"], scene, tmp_path).lost
     dns.run(scene, comm, tmp_path)
     assert product_provenance(tmp_path / "whole" / "ground_truth.h5") == kept  # what was made from it stays valid
     assert (tmp_path / "whole" / "scene.toml").read_text() == "# of another scene"
-    assert find_work(["dns"], scene, tmp_path).done == {"dns"} and not list(tmp_path.glob("*/LOCK"))
+    assert start(scene, tmp_path) == "skip" and not list(tmp_path.glob("*/LOCK"))
 
 
 @pytest.mark.mpi(1)
@@ -141,10 +145,10 @@ def test_a_stopped_simulation_with_sets_goes_on_for_longer(comm, tmp_path, caplo
     with pytest.raises(Stopped):
         dns.run(load_scene(TINY, [*SPLIT, *SETS]), comm, tmp_path, StopAtStep(comm, 11))
     longer = load_scene(TINY, [*SPLIT, *reversed(SETS), "tracers.turnovers=0.2"])  # also with the sets in another order
-    assert find_work(["dns"], longer, tmp_path).begun == {"dns"}
+    assert start(longer, tmp_path) == "continue"
     dns.run(longer, comm, tmp_path)
     assert "continues from step 11" in caplog.text
-    assert not find_work(["dns"], load_scene(TINY, [*SPLIT, *SETS]), tmp_path).done
+    assert start(load_scene(TINY, [*SPLIT, *SETS]), tmp_path) == "anew"
 
 
 @pytest.mark.mpi(1)

@@ -13,7 +13,7 @@ import numpy as np
 
 from eddies.clock import ROUND_OFF, Clock, ProgressLine
 from eddies.flow.history import FlowHistory
-from eddies.io.checkpoint import Guard
+from eddies.io.checkpoint import Checkpoint, Guard
 from eddies.io.fields import FieldWriter
 from eddies.io.frame_segments import FrameSegments
 from eddies.io.hdf5 import File, ProductError, create_product, in_files, open_product, write_table
@@ -50,29 +50,14 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     Raises SceneError if the checkpoint is later than the end of the run, and Stopped, after a checkpoint, if `stop`
     requests it.
     """
-    directory = Path(directory)
+    directory, sets = Path(directory), scene.tracer_sets
     product, course = directory / STAGES["dns"].file, stage_fingerprint(scene, "dns", DURATION_KEYS["dns"])
     guard = Guard(comm, directory / STAGES["dns"].checkpoints, course, stop)
-    saved, fluid = guard.checkpoints.newest(), build_fluid(scene.flow, scene.forcing, comm)
-    origin = on_first_rank(comm, lambda: product_provenance(product))
-    same_course = saved is not None and origin.get("course") == course
-    if saved is not None and saved["phase"] == "tracers" and not saved.files and not (
-            same_course and holds_frames(comm, product, saved["frames"])):
-        if comm.rank == 0:
-            log.warning("%s: lacks the frames before the checkpoint, so the checkpoint is not used", product)
-        guard.checkpoints.remove()
-        saved = None
-    state = initial_state(scene.initial, scene.seed, fluid) if saved is None else None
-    flow = FlowRun(fluid, state, STEPPERS[scene.time.stepper](fluid),
-                   build_step_limit(scene.time, scene.flow, fluid.grid), FlowHistory(fluid), guard,
-                   phase="start" if scene.spin_up is None else "spin-up", max_step=scene.time.max_step)
-    if saved is not None:
-        flow.load_state_dict(saved)
-        log.info("dns: continues from step %d, time %.4g", flow.clock.steps, flow.clock.time)
     provenance = {**stage_provenance(scene, "dns"), "course": course, "duration": scene.duration}
-    if same_course and saved is not None and scene.tracers is not None:
-        provenance["id"] = origin["id"]  # the frames so far do not change, so products made from them stay valid
-    sets = scene.tracer_sets
+    saved, kept = checkpoint_to_continue(guard, product, course)
+    if saved is not None and kept and scene.tracers is not None:
+        provenance["id"] = kept  # the frames so far do not change, so products made from them stay valid
+    flow = flow_of(scene, guard, saved)
     with ExitStack() as held:
         for name in sets:
             held.enter_context(lock_directory(comm, directory / name))
@@ -84,38 +69,85 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         if scene.tracers is None:
             run_for(flow, scene.time)
         else:
-            if flow.phase != "tracers":
-                saved = None
-                span = scene.tracers.turnovers * flow.history.sample(flow.state, flow.clock)["eddy_turnover_time"]
-                check_span(scene.time, flow.clock.time, span, flow.step_limit.bound(flow.state, flow.clock),
-                           scene.tracers)
-            layout = frame_layout(scene.tracers, fluid.compressible, fluid.grid.cutoff)
-            before = () if saved is None else saved.files or [f"../{product.name}"]
-            parts = held.enter_context(FrameSegments(comm, guard.checkpoints.path, layout, before))
-            whole = partial(unfiltered_frames, scene.simulation, scene.training, scene.tracers.field_every)
-            tracers = TracerRun(flow, parts, scene.tracers, scene.seed, whole, saved)
-            if tracers.interval > tracers.intervals:
-                raise too_late(guard, f"[tracers] turnovers = {scene.tracers.turnovers:g}")
+            tracers = released(flow, scene, product, saved, held)
             tracers.follow()
         final, last = flow.state_dict(), flow.history.sample(flow.state, flow.clock)
         for name, own in sets.items():
-            path = directory / name / product.name
-            if in_files(comm, path, partial(product_fingerprint, path)) == stage_fingerprint(own, "dns"):
-                continue  # it is kept, so products made from it stay valid
-            in_files(comm, path, partial(prepare_set, path.parent, own.to_toml()))
-            with create_product(comm, path, "ground_truth", stage_provenance(own, "dns")) as part:
-                write_tracers(part, tracers, name, parts, own.forcing)
-                write_flow(part, flow, scales_of(tracers.released) | tracers.scales(name), own.spin_up)
+            write_set(directory / name / product.name, own, tracers, name)
         if scene.tracers is None or sets:
             write_final_fields(file, flow)
             scales = scales_of(last)
         else:
-            write_tracers(file, tracers, "", parts, scene.forcing)
+            write_tracers(file, tracers, "", scene.forcing)
             scales = scales_of(tracers.released) | tracers.scales("")
         write_flow(file, flow, scales, scene.spin_up)
     guard.checkpoints.remove()
     if not sets:
         guard.checkpoints.write(flow.steps, final)
+
+
+def checkpoint_to_continue(guard: Guard, product: Path, course: str) -> tuple[Checkpoint | None, str]:
+    """Return the newest checkpoint that a run can continue from, or None, and the id of a product of the same course,
+    or an empty string; collective.
+
+    A checkpoint without frames needs those in the product, up to its own time. If they are missing, it is removed with
+    a warning.
+    """
+    comm, saved = guard.checkpoints.comm, guard.checkpoints.newest()
+    origin = on_first_rank(comm, lambda: product_provenance(product))
+    kept = origin["id"] if origin.get("course") == course else ""
+    if saved is not None and saved["phase"] == "tracers" and not saved.files and not (
+            kept and holds_frames(comm, product, saved["frames"])):
+        if comm.rank == 0:
+            log.warning("%s: lacks the frames before the checkpoint, so the checkpoint is not used", product)
+        guard.checkpoints.remove()
+        saved = None
+    return saved, kept
+
+
+def flow_of(scene: Scene, guard: Guard, saved: Checkpoint | None) -> FlowRun:
+    """Return the flow of a scene at its start or at a checkpoint; collective."""
+    fluid = build_fluid(scene.flow, scene.forcing, guard.checkpoints.comm)
+    state = initial_state(scene.initial, scene.seed, fluid) if saved is None else None
+    flow = FlowRun(fluid, state, STEPPERS[scene.time.stepper](fluid),
+                   build_step_limit(scene.time, scene.flow, fluid.grid), FlowHistory(fluid), guard,
+                   phase="start" if scene.spin_up is None else "spin-up", max_step=scene.time.max_step)
+    if saved is not None:
+        flow.load_state_dict(saved)
+        log.info("dns: continues from step %d, time %.4g", flow.clock.steps, flow.clock.time)
+    return flow
+
+
+def released(flow: FlowRun, scene: Scene, product: Path, saved: Checkpoint | None, held: ExitStack) -> TracerRun:
+    """Return the tracers of a scene, released now or at a checkpoint. `held` closes the file of their frames.
+
+    Raises SceneError if the flow is at rest, if the time to follow them takes too many steps, or if the checkpoint is
+    later than its end.
+    """
+    if flow.phase != "tracers":
+        saved = None
+        span = scene.tracers.turnovers * flow.history.sample(flow.state, flow.clock)["eddy_turnover_time"]
+        check_span(scene.time, flow.clock.time, span, flow.step_limit.bound(flow.state, flow.clock), scene.tracers)
+    layout = frame_layout(scene.tracers, flow.fluid.compressible, flow.fluid.grid.cutoff)
+    before = () if saved is None else saved.files or [f"../{product.name}"]
+    parts = held.enter_context(FrameSegments(flow.guard.checkpoints.comm, flow.guard.checkpoints.path, layout, before))
+    whole = partial(unfiltered_frames, scene.simulation, scene.training, scene.tracers.field_every)
+    tracers = TracerRun(flow, parts, scene.tracers, scene.seed, whole, saved)
+    if tracers.interval > tracers.intervals:
+        raise too_late(flow.guard, f"[tracers] turnovers = {scene.tracers.turnovers:g}")
+    return tracers
+
+
+def write_set(path: Path, own: Scene, tracers: TracerRun, name: str) -> None:
+    """Write the ground truth of the set of tracers `name`, whose scene is `own`; collective. A file with the same
+    settings is kept, so that products made from it stay valid."""
+    comm, flow = tracers.flow.guard.checkpoints.comm, tracers.flow
+    if in_files(comm, path, partial(product_fingerprint, path)) == stage_fingerprint(own, "dns"):
+        return
+    in_files(comm, path, partial(prepare_set, path.parent, own.to_toml()))
+    with create_product(comm, path, "ground_truth", stage_provenance(own, "dns")) as part:
+        write_tracers(part, tracers, name, own.forcing)
+        write_flow(part, flow, scales_of(tracers.released) | tracers.scales(name), own.spin_up)
 
 
 def prepare_set(directory: Path, text: str) -> None:
@@ -124,10 +156,10 @@ def prepare_set(directory: Path, text: str) -> None:
         write_files({directory / "scene.toml": text})
 
 
-def write_tracers(file: File, tracers: TracerRun, name: str, parts: FrameSegments, forcing: Forcing | None) -> None:
-    """Write the frames, fields and spectra of the set of tracers `name`; collective. `parts` holds the frames so far.
-    If the flow is forced after the release, `forcing` is written, too."""
-    parts.assemble(file, series_of(name))
+def write_tracers(file: File, tracers: TracerRun, name: str, forcing: Forcing | None) -> None:
+    """Write the frames, fields and spectra of the set of tracers `name`; collective. If the flow is forced after the
+    release, `forcing` is written, too."""
+    tracers.segments.assemble(file, series_of(name))
     if tracers.flow.fluid.forcing is not None:
         file.create_group("forcing").attrs.update(asdict(forcing))
     tracers.sets[name].write_spectra(file)

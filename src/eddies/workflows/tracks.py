@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from eddies.analysis.errors import fluctuations
 from eddies.analysis.isotropic_turbulence import dissipation_constant
 from eddies.flow.statistics import component_energies, energy_spectrum, gradient_moments, turbulence_scales
 from eddies.io.fields import FieldWriter
-from eddies.io.hdf5 import create_product, in_files, write_table
+from eddies.io.hdf5 import File, create_product, in_files, write_table
 from eddies.io.trajectories import TrajectoryWriter
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import IdOrder, id_block, migrate
@@ -42,6 +43,8 @@ LEAST_TRACKS = 8        # least number of tracks that a model needs
 LEAST_CELLS = 10        # [flow] cells for few tracks; with fewer, checks of [initial], which is not used, fail
 INTEGRAL_SCALE = 0.2    # integral scale divided by the edge of the box: a guess, for estimates before the run
 ROUNDS = 20             # iterations for the dissipation rate; each reduces the error to a third
+
+Columns = dict[str, np.ndarray]
 
 
 def with_tracks(scene: Scene, comm: Comm) -> Scene:
@@ -134,82 +137,118 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     dissipation rate is the value of the literature for the measured velocity and integral scale
     (`dissipation_constant`).
     """
-    tracers, tracks, filtered = scene.tracers, TrackFrames(comm, scene.tracks), scene.tracks.filtered
-    viscosity, follows = scene.flow.viscosity, tracers.filtered and not filtered
-    complete, times, spacing = tracks.complete, tracks.times, tracks.spacing
-    settings = Reconstruction(method="memory" if follows and viscosity > 0 else "least-squares")
-    own = tracers.with_count(count_for(spacing))
-    first, second = tracks.shared(0, 1), tracks.shared(1, 0)
-    reference = {"filter_width": tracers.filter_width, "spacing": tracers.spacing, "density_mean": 1.0,
-                 "viscosity": viscosity, **measured_scales(comm, first, second, times[1])}
-    width = tracers.filter_width if filtered else NO_FILTER * spacing
-    found = {"kolmogorov_length": 0.0} | reference
-    # The first pass does not know the Kolmogorov length. The prior of the second pass uses that of the first pass.
-    for resolved in (own, settings.resolving(own, filtered))[:2 if viscosity > 0 else 1]:
-        slab = slabs_for(comm, own, resolved, width, found["kolmogorov_length"])
-        particles = particles_on(slab, tracks.frame(0))
-        make = partial(solver_of, slab, found | {"spacing": resolved.spacing, "filter_width": width})
-        solver, weight, error = best_solver(particles, make, uniform=tracks.uniform)
-        first_method = UniformMethod(solver) if tracks.uniform else LeastSquaresMethod(solver)
-        flow = FrameFlow(solver.grid, first_method.of(particles, 0.0), particles, filtered, tracers.filter_width)
-        found = flow.scales(viscosity) | reference  # velocity_rms is that of the particles
-    reference = found
-    coarse = SpectralGrid(SlabDecomposition(comm, BOX_LENGTH, tracers.cells), cutoff=(tracers.cells - 1) // 2)
-    sound = {"sound_speed": scene.flow.sound_speed or math.inf}
-    if scene.flow.compressible:
-        sound["mach_turbulent"] = math.sqrt(2 * flow.energy.sum()) / scene.flow.sound_speed
+    tracks, viscosity = TrackFrames(comm, scene.tracks), scene.flow.viscosity
+    follows = scene.tracers.filtered and not scene.tracks.filtered
+    flows = FittedFlows.of(tracks, scene.tracers, scene.tracks.filtered, viscosity, follows)
     with create_product(comm, Path(directory) / STAGES["dns"].file, "ground_truth",
                         stage_provenance(scene, "dns")) as file:
-        traced, paths = FilteredTracers(slab, tracks.frame(0)) if follows else None, []
-        count = traced.total if traced else complete
-        shapes = {name: values.shape[1:] for name, values in first.items() if name != "id"}
-        trajectory = (TrajectoryWriter(file, "tracers", count, BOX_LENGTH, shapes, np.float64)
-                      if count >= LEAST_TRACKS else None)
-        fields = FieldWriter(file, "filtered", coarse.cells, {"velocity": 3})
+        paths, rows, spectra = write_frames(file, flows, tracks, scene.tracers, viscosity, follows, stop)
+        reference = flows.reference | (measured_scales(comm, *paths, tracks.times[1]) if follows else {})
+        energy = float(spectra["energy"][0].sum())
+        sound = {"sound_speed": scene.flow.sound_speed or math.inf}
+        if scene.flow.compressible:
+            sound["mach_turbulent"] = math.sqrt(2 * energy) / scene.flow.sound_speed
+        file.create_group("reference").attrs.update({**reference, "released_at": 0.0, "energy": energy, **sound})
+        write_table(file, "statistics", {name: np.array([row[name] for row in rows]) for name in rows[0]})
+        write_table(file, "spectra", {"wavenumber": np.arange(spectra["energy"].shape[1]), **spectra})
+        file.create_group("tracks").attrs.update({
+            **tracks.about, "complete": tracks.complete, "mean_count": tracks.mean_count, "weight": flows.weight,
+            **({} if math.isnan(flows.error) else {"validation_error": flows.error}), "traced": follows})
+    log.info("dns: %d tracks, on average %.0f in a frame; %d are in each of the %d frames; duration %.3g T, u' = %.3g, "
+             "L = %.3g",
+             tracks.about["in_file"], tracks.mean_count, tracks.complete, len(tracks.times),
+             tracks.times[-1] / reference["eddy_turnover_time"], math.sqrt(2 * energy / 3), reference["integral_scale"])
+
+
+def write_frames(file: File, flows: FittedFlows, tracks: TrackFrames, tracers: Tracers, viscosity: float,
+                 follows: bool, stop: StopRequest | None) -> tuple[list[Columns], list[dict[str, float]], Columns]:
+    """Write the particles of each frame, and every few frames the filtered field; collective.
+
+    The particles are FilteredTracers if `follows` is true, else the tracks that are in all frames. Returns the rows of
+    this rank in the first two frames of FilteredTracers, the statistics of the flow in each stored frame, and the
+    columns `time`, `energy` and `filtered` of its spectra. Raises Stopped if `stop` requests it.
+    """
+    comm, times, complete = tracks.comm, tracks.times, tracks.complete
+    coarse = SpectralGrid(SlabDecomposition(comm, BOX_LENGTH, tracers.cells), cutoff=(tracers.cells - 1) // 2)
+    traced = FilteredTracers(flows.slab, tracks.frame(0)) if follows else None
+    count = traced.total if traced else complete
+    shapes = {name: values.shape[1:] for name, values in tracks.shared(0, 1).items() if name != "id"}
+    trajectory = (TrajectoryWriter(file, "tracers", count, BOX_LENGTH, shapes, np.float64)
+                  if count >= LEAST_TRACKS else None)
+    fields = FieldWriter(file, "filtered", coarse.cells, {"velocity": 3})
+    paths, rows, spectra = [], [], []
+    for frame, time in enumerate(times):
+        if stop is not None:
+            stop.check()
+        stored = frame % tracers.field_every == 0
+        flow = flows.at(tracks.frame(frame), time) if stored or traced else None
+        if traced:
+            start, columns = traced.follow(flow, times[1] if frame else 0.0)
+            paths += [columns] if frame < 2 else []
+        else:
+            start, columns = id_block(comm, complete)[0], tracks.frame(frame, complete=True)
+        if trajectory:
+            trajectory.append(frame, time, start, columns)
+        if not stored:
+            continue
+        grid, modes = flow.grid.spectral, as_numpy(flow.filtered)
+        fields.append(time, coarse.decomposition.start, {"velocity": coarse.backward(regrid(grid, coarse, modes))})
+        row = flow.scales(viscosity) | {"time": time, "energy": flow.energy.sum()}
+        skewness, flatness = gradient_moments(grid, modes)
+        rows.append(row | {"skewness": skewness, "flatness": flatness} | component_energies(grid, modes))
+        spectra.append((time, flow.energy, flow.filtered_energy))
+    return paths, rows, dict(zip(("time", "energy", "filtered"), map(np.array, zip(*spectra))))
+
+
+@dataclass(frozen=True)
+class FittedFlows:
+    """The velocity fields of measured tracks, by one method for all frames.
+
+    slab, grid, method: the slabs, the grid, and the method that finds the modes of a frame. reference: the scales of
+    the flow in the first frame. weight, error: the weight of the noise, and the error at left-out tracks, NaN if it was
+    not measured. filtered, filter_width: as in `FrameFlow`.
+    """
+
+    slab: SlabDecomposition
+    grid: FourierGrid
+    method: Any
+    reference: dict[str, float]
+    weight: float
+    error: float
+    filtered: bool
+    filter_width: float
+
+    @classmethod
+    def of(cls, tracks: TrackFrames, tracers: Tracers, filtered: bool, viscosity: float,
+           follows: bool) -> FittedFlows:
+        """Choose the method by the first frame; collective."""
+        settings = Reconstruction(method="memory" if follows and viscosity > 0 else "least-squares")
+        own = tracers.with_count(count_for(tracks.spacing))
+        known = {"filter_width": tracers.filter_width, "spacing": tracers.spacing, "density_mean": 1.0,
+                 "viscosity": viscosity,
+                 **measured_scales(tracks.comm, tracks.shared(0, 1), tracks.shared(1, 0), tracks.times[1])}
+        width = tracers.filter_width if filtered else NO_FILTER * tracks.spacing
+        found = {"kolmogorov_length": 0.0} | known
+        # The first pass does not know the Kolmogorov length. The prior of the second pass uses that of the first pass.
+        for resolved in (own, settings.resolving(own, filtered))[:2 if viscosity > 0 else 1]:
+            slab = slabs_for(tracks.comm, own, resolved, width, found["kolmogorov_length"])
+            particles = particles_on(slab, tracks.frame(0))
+            make = partial(solver_of, slab, found | {"spacing": resolved.spacing, "filter_width": width})
+            solver, weight, error = best_solver(particles, make, uniform=tracks.uniform)
+            first = UniformMethod(solver) if tracks.uniform else LeastSquaresMethod(solver)
+            flow = FrameFlow(solver.grid, first.of(particles, 0.0), particles, filtered, tracers.filter_width)
+            found = flow.scales(viscosity) | known  # velocity_rms is that of the particles
         # A memory is of an unfiltered flow: G = 1.
         method = UniformMethod(solver) if tracks.uniform else solving_method(
             settings, solver, viscosity, torch.ones_like(solver.grid.shell), weight)
-        rows, spectra = [], []
-        for frame, time in enumerate(times):
-            if stop is not None:
-                stop.check()
-            stored = frame % tracers.field_every == 0
-            if stored or traced:
-                particles = particles_on(slab, tracks.frame(frame))
-                with torch.no_grad():
-                    flow = FrameFlow(solver.grid, method.of(particles, time), particles, filtered,
-                                     tracers.filter_width)
-            if traced:
-                start, columns = traced.follow(flow, times[1] if frame else 0.0)
-                paths += [columns] if frame < 2 else []
-            else:
-                start, columns = id_block(comm, complete)[0], tracks.frame(frame, complete=True)
-            if trajectory:
-                trajectory.append(frame, time, start, columns)
-            if not stored:
-                continue
-            grid, modes = flow.grid.spectral, as_numpy(flow.filtered)
-            planes = coarse.backward(regrid(grid, coarse, modes))
-            fields.append(time, coarse.decomposition.start, {"velocity": planes})
-            row = flow.scales(viscosity) | {"time": time, "energy": flow.energy.sum()}
-            skewness, flatness = gradient_moments(grid, modes)
-            rows.append(row | {"skewness": skewness, "flatness": flatness} | component_energies(grid, modes))
-            spectra.append((time, flow.energy, flow.filtered_energy))
-        if traced:
-            reference |= measured_scales(comm, *paths, times[1])
-        file.create_group("reference").attrs.update({
-            **reference, "released_at": 0.0, "energy": float(spectra[0][1].sum()), **sound})
-        write_table(file, "statistics", {name: np.array([row[name] for row in rows]) for name in rows[0]})
-        table = dict(zip(("time", "energy", "filtered"), map(np.array, zip(*spectra))))
-        write_table(file, "spectra", {"wavenumber": np.arange(table["energy"].shape[1]), **table})
-        file.create_group("tracks").attrs.update({
-            **tracks.about, "complete": complete, "mean_count": tracks.mean_count, "weight": weight,
-            **({} if math.isnan(error) else {"validation_error": error}), "traced": follows})
-    log.info("dns: %d tracks, on average %.0f in a frame; %d are in each of the %d frames; duration %.3g T, u' = %.3g, "
-             "L = %.3g",
-             tracks.about["in_file"], tracks.mean_count, complete, len(times),
-             times[-1] / reference["eddy_turnover_time"], math.sqrt(2 * float(spectra[0][1].sum()) / 3),
-             reference["integral_scale"])
+        return cls(slab, solver.grid, method, found, weight, error, filtered, tracers.filter_width)
+
+    @torch.no_grad()
+    def at(self, columns: Columns, time: float) -> FrameFlow:
+        """Return the field of the frame at a time; `columns` are the tracks of this rank. Frames come in order."""
+        particles = particles_on(self.slab, columns)
+        return FrameFlow(self.grid, self.method.of(particles, time), particles, self.filtered,
+                         self.filter_width)
 
 
 class FrameFlow:

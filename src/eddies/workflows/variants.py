@@ -84,6 +84,34 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
     if not scene.variant and not scene.realisations:
         making = tuple(stage for stage in stages if stage in MAKING)
         return [Step(scene, making, directory, files=_files(making, directory, scene.sets))] if making else []
+    seeds = scene.realisations or ()
+    found: list[Step] = []
+    made: dict[tuple[str, str], Path] = {}
+    for name, own, where, possible in _planned(scene, directory, names):
+        working, links = [], {}
+        for stage in [stage for stage in STAGES if stage in own.stages and stage in MAKING]:
+            key = stage, stage_fingerprint(own, stage)
+            from_file = stage not in SHARED and own.model is not None and own.model.path is not None
+            holder = None if from_file else made.get(key)
+            if holder is not None and holder != where:
+                links[stage] = holder
+                if seeds and stage == "train" and stage in possible and stage in stages:
+                    working.append(stage)  # this step makes the link from which rollouts take their weights
+            elif stage in possible and holder is None:
+                made[key] = where
+                if stage == "dns":
+                    made |= {(stage, fingerprint): (where / path).parent
+                             for path, fingerprint in set_files(own).items()}
+                working += [stage] if stage in stages else []
+        if working:
+            found.append(Step(own, tuple(working), where, name, links, _files(working, where, own.sets)))
+    return found
+
+
+def _planned(scene: Scene, directory: Path,
+             names: Sequence[str]) -> list[tuple[str | None, Scene, Path, Sequence[str]]]:
+    """Return for each step, in order, the variant (None: all), the scene, the directory, and the stages that may run
+    there, unless their product is made elsewhere. The arguments are those of `steps`."""
     whole, seeds = scene.without_variants, scene.realisations or ()
     # Fingerprint of each ground truth that a variant may use, and its directory relative to that of the scene or of a
     # realisation.
@@ -116,27 +144,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
     for together in zip(*(runs[name or scene.name].items() for name in chosen)):
         planned += [(name, own, where, (*SHARED, *(("train",) if seeds else ()), "simulate"))
                     for name, (where, own) in zip(chosen, together)]
-    found: list[Step] = []
-    made: dict[tuple[str, str], Path] = {}
-    for name, own, where, possible in planned:
-        working, links = [], {}
-        for stage in [stage for stage in STAGES if stage in own.stages and stage in MAKING]:
-            key = stage, stage_fingerprint(own, stage)
-            from_file = stage not in SHARED and own.model is not None and own.model.path is not None
-            holder = None if from_file else made.get(key)
-            if holder is not None and holder != where:
-                links[stage] = holder
-                if seeds and stage == "train" and stage in possible and stage in stages:
-                    working.append(stage)  # this step makes the link from which rollouts take their weights
-            elif stage in possible and holder is None:
-                made[key] = where
-                if stage == "dns":
-                    made |= {(stage, fingerprint): (where / path).parent
-                             for path, fingerprint in set_files(own).items()}
-                working += [stage] if stage in stages else []
-        if working:
-            found.append(Step(own, tuple(working), where, name, links, _files(working, where, own.sets)))
-    return found
+    return planned
 
 
 def _files(stages: Sequence[str], directory: Path, sets: Collection[str]) -> tuple[Path, ...]:

@@ -36,16 +36,83 @@ def save(comm, directory, scene, stage, step):
     checkpoints.write(step, {"a": 1})
 
 
+def starts(work):
+    return {stage: course.start for stage, course in work.courses.items()}
+
+
+FOUND = {"none": None, "same": "tracers.turnovers=0.6", "shorter": "tracers.turnovers=0.5",
+         "longer": "tracers.turnovers=0.7", "other": "seed=5", "damaged": ""}
+CHECKPOINTS = {"no": None, "fitting": "seed=1", "foreign": "seed=6"}
+PRODUCT, BOTH = ["ground_truth.h5"], ["ground_truth.h5", "checkpoints"]
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("product, checkpoints, start, drops, lost", [
+    ("none", "no", "anew", False, []),
+    ("none", "fitting", "continue", False, []),
+    ("none", "foreign", "anew", True, ["checkpoints"]),
+    ("same", "no", "skip", False, []),
+    ("same", "fitting", "skip", False, []),
+    ("same", "foreign", "skip", False, []),
+    ("shorter", "no", "anew", False, PRODUCT),
+    ("shorter", "fitting", "continue", False, []),
+    ("shorter", "foreign", "anew", True, BOTH),
+    ("longer", "no", "anew", False, PRODUCT),
+    ("longer", "fitting", "anew", True, PRODUCT),
+    ("longer", "foreign", "anew", True, BOTH),
+    ("other", "no", "anew", False, PRODUCT),
+    ("other", "fitting", "continue", False, PRODUCT),
+    ("other", "foreign", "anew", True, BOTH),
+    ("damaged", "no", "anew", False, PRODUCT),
+    ("damaged", "fitting", "continue", False, PRODUCT),
+    ("damaged", "foreign", "anew", True, BOTH),
+])
+def test_what_is_found_decides_what_a_run_does(comm, tmp_path, scene, product, checkpoints, start, drops, lost):
+    """The table of cases, for the direct simulation of a scene with 0.6 turnovers."""
+    course = "course of the product"
+    if FOUND[product]:
+        other = load_scene(TINY, [FOUND[product]])
+        course = stage_fingerprint(other, "dns", DURATION_KEYS["dns"])
+        with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", stage_provenance(other, "dns") | {
+                "course": course, "duration": other.duration}):
+            pass
+    elif product == "damaged":
+        (tmp_path / "ground_truth.h5").write_bytes(b"damaged")
+    if CHECKPOINTS[checkpoints]:
+        of = load_scene(TINY, [CHECKPOINTS[checkpoints]])
+        CheckpointDirectory(comm, tmp_path / "checkpoints", stage_fingerprint(of, "dns", DURATION_KEYS["dns"])).write(
+            5, {"a": 1})
+    work = find_work(["dns"], scene, tmp_path)
+    assert (work.courses["dns"].start, work.courses["dns"].drops) == (start, drops)
+    assert [each.split()[0] for each in work.lost] == lost
+    if lost:
+        with pytest.raises(WouldReplaceWork, match="--overwrite"):
+            find_work(["dns"], scene, tmp_path, overwrite=False)
+    else:
+        find_work(["dns"], scene, tmp_path, overwrite=False)
+
+
+@pytest.mark.mpi(1)
+def test_the_last_state_of_a_product_is_not_listed_beside_it(comm, tmp_path, scene):
+    course = stage_fingerprint(scene, "dns", DURATION_KEYS["dns"])
+    CheckpointDirectory(comm, tmp_path / "checkpoints", course).write(9, {})
+    provenance = stage_provenance(scene, "dns") | {"course": course, "duration": scene.duration}
+    with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", provenance):
+        pass
+    work = find_work(["dns"], load_scene(TINY, ["seed=5"]), tmp_path)
+    assert [each.split()[0] for each in work.lost] == ["ground_truth.h5"] and work.courses["dns"].drops
+
+
 @pytest.mark.mpi(1)
 def test_what_fits_is_done_whatever_is_to_be_made_before_it(comm, tmp_path, scene):
     for directory in (tmp_path, tmp_path / "nowhere"):
         work = find_work(scene.stages, scene, directory)
-        assert not work.done and not work.obsolete and not work.lost
+        assert {*starts(work).values()} == {"anew"} and not work.lost
     leave(comm, tmp_path, scene)
-    assert find_work(scene.stages, scene, tmp_path).done == set(MAKING)
+    assert {*starts(find_work(MAKING, scene, tmp_path)).values()} == {"skip"}
     (tmp_path / "kernel.h5").unlink()
-    work = find_work(scene.stages, scene, tmp_path)
-    assert work.done == {"dns", "train", "simulate"} and not work.lost
+    work = find_work(MAKING, scene, tmp_path)
+    assert starts(work) == dict.fromkeys(MAKING, "skip") | {"train-kernel": "anew"} and not work.lost
     # A link is not work, whatever it leads to.
     leave(comm, tmp_path, load_scene(TINY, ["kernel.steps=5"]), ["train-kernel"])
     (tmp_path / "here").mkdir()
@@ -66,8 +133,8 @@ def test_what_would_be_replaced_is_named_with_cost_and_reason(comm, tmp_path, sc
     leave(comm, tmp_path, scene)
     (tmp_path / "stage_seconds.json").write_text(json.dumps({"dns": 125, "simulate": 3.2}))
     work = find_work(stages, load_scene(TINY, [change]), tmp_path)
-    assert [each.split()[0] for each in work.lost] == lost and work.done == set(stages) - {
-        stage for stage in stages if STAGES[stage].file in lost}
+    assert [each.split()[0] for each in work.lost] == lost
+    assert starts(work) == {stage: "anew" if STAGES[stage].file in lost else "skip" for stage in stages}
     if not lost:
         return work.refuse_to_lose()
     with pytest.raises(WouldReplaceWork) as refused:
@@ -80,13 +147,9 @@ def test_what_would_be_replaced_is_named_with_cost_and_reason(comm, tmp_path, sc
 
 
 @pytest.mark.mpi(1)
-def test_checkpoints_of_other_settings_are_work_too(comm, tmp_path, scene):
+def test_checkpoints_that_would_be_lost_are_named_with_step_time_and_reason(comm, tmp_path, scene):
     other = load_scene(TINY, ["training.steps=70"])
     save(comm, tmp_path, other, "train", 5)
-    work = find_work(scene.stages, scene, tmp_path)
-    assert work.obsolete == {"train"} and not work.begun
-    with pytest.raises(WouldReplaceWork, match=r"checkpoints-train \(step 5\)"):
-        work.refuse_to_lose()
     (tmp_path / "scene.toml").write_text(other.to_toml())
     (tmp_path / "stage_seconds.json").write_text('{"train": 125}')
     with pytest.raises(WouldReplaceWork, match=r"steps = 70, now 60.* checkpoints-train \(step 5, took 2 min 05 s\)"):
@@ -96,37 +159,16 @@ def test_checkpoints_of_other_settings_are_work_too(comm, tmp_path, scene):
     save(comm, tmp_path, scene, "train", 3)
     assert not find_work(scene.stages, scene, tmp_path).lost  # there is one to go on from
     (tmp_path / "checkpoints-train/step-00000003.h5").write_text("damaged")
-    assert find_work(scene.stages, scene, tmp_path).obsolete == {"train"}
+    assert find_work(scene.stages, scene, tmp_path).courses["train"].drops
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("turnovers, begun, lost", [(0.7, True, []), (0.5, False, ["ground_truth.h5"])])
-def test_the_last_state_of_a_ground_truth_is_for_longer_ones(comm, tmp_path, scene, turnovers, begun, lost):
-    """The scene's own has 0.6 turnovers. Its last state is not listed beside it."""
-    course = {"course": stage_fingerprint(scene, "dns", DURATION_KEYS["dns"]), "duration": scene.duration}
-    CheckpointDirectory(comm, tmp_path / "checkpoints", course["course"]).write(9, {})
-    provenance = stage_provenance(scene, "dns") | course
-    with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", provenance):
-        pass
-    work = find_work(["dns"], scene, tmp_path)
-    assert work.done == {"dns"} and not work.obsolete
-    work = find_work(["dns"], load_scene(TINY, [f"tracers.turnovers={turnovers}"]), tmp_path)
-    assert (work.begun == {"dns"}) == begun and [each.split()[0] for each in work.lost] == lost
-    assert (work.obsolete == {"dns"}) != begun
-    work = find_work(["dns"], load_scene(TINY, ["seed=5"]), tmp_path)
-    assert [each.split()[0] for each in work.lost] == ["ground_truth.h5"] and work.obsolete == {"dns"}
-
-
-@pytest.mark.mpi(1)
-def test_checkpoints_beside_a_product_that_fits_are_for_whoever_replaces_it(comm, tmp_path, scene):
+def test_checkpoints_left_beside_a_model_are_removed(comm, tmp_path, scene):
+    """Those of a direct simulation stay, because a longer run continues from them."""
     leave(comm, tmp_path, scene, ["train"])
-    other = load_scene(TINY, ["training.steps=70"])
-    save(comm, tmp_path, other, "train", 5)
-    work = find_work(["train"], scene, tmp_path)
-    assert work.done == {"train"} and not work.obsolete and not work.lost
-    assert [each.split()[0] for each in find_work(["train"], other, tmp_path).lost] == ["model.h5"]
-    save(comm, tmp_path, scene, "train", 7)  # left behind, as the product is complete
-    assert find_work(["train"], scene, tmp_path).obsolete == {"train"}
+    save(comm, tmp_path, scene, "train", 7)
+    course = find_work(["train"], scene, tmp_path).courses["train"]
+    assert course.start == "skip" and course.drops
 
 
 @pytest.mark.mpi(1)

@@ -12,7 +12,7 @@ from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,14 +40,39 @@ class WouldReplaceWork(UserError):
     """A command would replace work that was made with other settings."""
 
 
+class Course(NamedTuple):
+    """What a run does with the work of a stage that it finds.
+
+    start: "skip" the stage, "continue" from its checkpoint, or start "anew". drops: whether its checkpoints are removed
+    first. loses: which of "product" and "checkpoints" hold work that would be lost.
+    """
+
+    start: str
+    drops: bool = False
+    loses: tuple[str, ...] = ()
+
+
+BOTH = ("product", "checkpoints")
+#: The course by what is found: first the product, then no checkpoint, those of the same settings, those of others.
+#: The product is that of no run, of the same settings, of the same settings but a shorter or longer time, or of others
+#: (or damaged). Checkpoints of the same settings may differ in the time, too.
+COURSES = {
+    "none": (Course("anew"), Course("continue"), Course("anew", True, ("checkpoints",))),
+    # What is left of a complete run is removed. Checkpoints of other settings may still be continued.
+    "same": (Course("skip"), Course("skip", True), Course("skip")),
+    "shorter": (Course("anew", False, ("product",)), Course("continue"), Course("anew", True, BOTH)),
+    # The checkpoint may lie after the end of the run.
+    "longer": (Course("anew", False, ("product",)), Course("anew", True, ("product",)), Course("anew", True, BOTH)),
+    "other": (Course("anew", False, ("product",)), Course("continue", False, ("product",)), Course("anew", True, BOTH)),
+}
+
+
 @dataclass(frozen=True)
 class Work:
     """The work that stages find in a run directory."""
 
     directory: Path
-    done: frozenset[str]  # stages whose product is complete and was made with the same settings
-    begun: frozenset[str]  # stages that continue from a checkpoint
-    obsolete: frozenset[str]  # stages whose checkpoints are left over from a complete run, or belong to other settings
+    courses: Mapping[str, Course]  # what a run does, by stage
     lost: tuple[str, ...]  # the files that the stages would replace, each with its wall time or date
     changes: tuple[str, ...]  # the settings that differ from those of the lost files
 
@@ -67,52 +92,76 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
     replaced and `overwrite` is false. Raises ProductError if the system refuses to read a product or a checkpoint: such
     a file may be undamaged, and must not be replaced.
     """
-    done, begun, obsolete, lost, changes = set(), set(), set(), [], {}
-    seconds = stage_seconds(directory)
+    courses, lost, changes = {}, [], {}
     for stage in [STAGES[name] for name in (*links, *stages) if STAGES[name].product is not None]:
-        product, settings = directory / stage.file, stage_fingerprint(scene, stage.name)
-        checkpoints = checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
-        keys = DURATION_KEYS.get(stage.name)
-        continued = stage_fingerprint(scene, stage.name, keys) if keys else settings
-        of_others = checkpoints and continued not in [fingerprint for _, fingerprint in checkpoints]
-        origin = product_provenance(product)
-        complete, sets = origin.get("fingerprint") == settings, set_files(scene) if stage.name == "dns" else {}
-        of_sets = {path: product_provenance(directory / path) for path in sets}
-        if complete and all(of_sets[path].get("fingerprint") == fingerprint for path, fingerprint in sets.items()):
-            done.add(stage.name)
-            # Checkpoints of other settings may still be continued. Those of a direct simulation serve a longer run.
-            if not of_others and stage.name != "dns":
-                obsolete.add(stage.name)
-            continue
-        for path, fingerprint in sets.items():
-            if of_sets[path].get("fingerprint") != fingerprint and (directory / path).is_file():
-                lost.append(f"{path}{_cost(of_sets[path], None)}")
-                changes |= dict.fromkeys(changed_settings(stage, of_sets[path].get("scene"), scene.to_toml()))
-        same_course = checkpoints and not of_others and origin.get("course") == continued and stage.name not in links
-        if same_course and origin["duration"] > scene.duration:
-            obsolete.add(stage.name)  # the checkpoint may lie after the end of the shorter run
-        elif same_course:
-            begun.add(stage.name)
-            continue
-        if product.is_file() and not product.is_symlink() and not complete:
-            if not origin:
-                _check_readable(product)
-            lost.append(stage.file + _cost(origin, seconds.get(stage.name)))
-            changes |= dict.fromkeys(changed_settings(stage, origin.get("scene"), scene.to_toml()))
-        if checkpoints and not of_others and stage.name not in obsolete:
-            begun.add(stage.name)
-        if of_others:
-            obsolete.add(stage.name)
-            if origin.get("course") in [fingerprint for _, fingerprint in checkpoints]:
-                continue  # the checkpoint holds the last state of the product, and the product is already in `lost`
-            seconds_so_far = seconds.get(stage.name)
-            cost = "" if seconds_so_far is None else f", took {duration(seconds_so_far)}"
-            lost.append(f"{stage.checkpoints} (step {checkpoints[0][0]}{cost})")
-            changes |= dict.fromkeys(changed_settings(stage, _scene_of(directory), scene.to_toml()))
-    work = Work(directory, frozenset(done), frozenset(begun), frozenset(obsolete), tuple(lost), tuple(changes))
+        found = FoundWork.of(stage, scene, directory)
+        courses[stage.name] = found.course
+        lost += found.lost
+        for then in found.scenes_of_lost:
+            changes |= dict.fromkeys(changed_settings(stage, then, scene.to_toml()))
+    work = Work(directory, courses, tuple(lost), tuple(changes))
     if not overwrite:
         work.refuse_to_lose()
     return work
+
+
+@dataclass(frozen=True)
+class FoundWork:
+    """The work of one stage in a run directory: its course, and the files that would be lost.
+
+    lost: their names, each with its cost. scenes_of_lost: the scenes with which they were made, as text; None if
+    unknown.
+    """
+
+    course: Course
+    lost: list[str]
+    scenes_of_lost: list[str | None]
+
+    @classmethod
+    def of(cls, stage: Stage, scene: Scene, directory: Path) -> FoundWork:
+        """Return the work of a stage in `directory`."""
+        origin, checkpoints = product_provenance(directory / stage.file), []
+        if stage.checkpoints:
+            checkpoints = checkpoints_in(directory / stage.checkpoints)
+        sets = _other_sets(scene, directory) if stage.name == "dns" else {}
+        product = _product_state(stage, scene, directory / stage.file, origin)
+        if sets and product == "same":  # the whole is there, but not all its parts
+            product = "none"
+        continued = stage_fingerprint(scene, stage.name, DURATION_KEYS.get(stage.name, ()))
+        fingerprints = [fingerprint for _, fingerprint in checkpoints]
+        course = COURSES[product][0 if not checkpoints else 1 if continued in fingerprints else 2]
+        if stage.name == "dns" and course == Course("skip", True):
+            course = Course("skip")  # the last state serves a longer run
+        seconds = stage_seconds(directory).get(stage.name)
+        lost = {f"{path}{_cost(other, None)}": other.get("scene") for path, other in sets.items()
+                if (directory / path).is_file()}
+        if "product" in course.loses:
+            lost[stage.file + _cost(origin, seconds)] = origin.get("scene")
+        if "checkpoints" in course.loses and origin.get("course") not in fingerprints:  # else the product's last state
+            took = "" if seconds is None else f", took {duration(seconds)}"
+            lost[f"{stage.checkpoints} (step {checkpoints[0][0]}{took})"] = _scene_of(directory)
+        return cls(course, list(lost), list(lost.values()))
+
+
+def _product_state(stage: Stage, scene: Scene, product: Path, origin: Mapping[str, Any]) -> str:
+    """Return which row of COURSES holds for a product. `origin` is its provenance, empty if it cannot be read."""
+    if origin.get("fingerprint") == stage_fingerprint(scene, stage.name):
+        return "same"
+    if not product.is_file() or product.is_symlink():  # a link is not work
+        return "none"
+    if not origin:
+        _check_readable(product)
+    if stage.name in DURATION_KEYS and origin.get("course") == stage_fingerprint(scene, stage.name,
+                                                                                 DURATION_KEYS[stage.name]):
+        return "longer" if origin["duration"] > scene.duration else "shorter"
+    return "other"
+
+
+def _other_sets(scene: Scene, directory: Path) -> dict[Path, dict[str, Any]]:
+    """Return the provenance of each ground truth of a set of tracers that lacks or has other settings, by path."""
+    origins = {path: product_provenance(directory / path) for path in set_files(scene)}
+    return {path: origins[path] for path, wanted in set_files(scene).items()
+            if origins[path].get("fingerprint") != wanted}
 
 
 def link_products(products: Mapping[Path, str], directory: Path) -> None:
