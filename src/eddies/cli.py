@@ -211,8 +211,7 @@ def run_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> 
     stop = StopRequest(comm, signals, directory / "STOP", 60 * options.max_minutes,
                        60 * options.checkpoint_minutes)
     stages = scene.stages_of_all if options.command == "run" else (options.command,)
-    run_stages(stages, scene, comm, directory, stop, options.overwrite, options.take_over,
-               getattr(options, "variants", ()))
+    run_stages(stages, scene, comm, directory, stop, options.overwrite, getattr(options, "variants", ()))
     last = STAGES[stages[-1]]
     made = directory / (last.file if last.product else REPORT)
     log.log(OUTCOME, "%s: %s, after %s: %s", options.command, scene.name, duration(time.perf_counter() - start),

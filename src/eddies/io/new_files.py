@@ -16,9 +16,6 @@ Measures 1 and 2 prevent this. Measure 3 is for an h5py that was built without M
    is left open, as NAME.partial, and the job is aborted.
 3. Without MPI in h5py, rank 0 writes for all: `own_part` sends it the blocks of the other ranks. The other ranks have
    a file in memory with the same groups, attributes and shapes, so callers see no difference.
-
-A job may lose its run directory to another job (io/run_lock.py), which then writes a NAME.partial of its own. So a job
-renames or removes a file only if it is still the file that this job created.
 """
 
 from __future__ import annotations
@@ -40,7 +37,6 @@ from mpi4py import MPI
 
 from eddies.io.checksums import add_checksums
 from eddies.io.errors import ProductError, WriteError, file_errors, space_in_words
-from eddies.io.run_lock import RunTakenOver
 from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank
 from eddies.parallel.stop import Stopped
 
@@ -94,17 +90,17 @@ def new_file(comm: MPI.Comm, path: Path, checksums: bool = True) -> Iterator[h5p
         with writing(new.file, 0):
             new.close()
         with file_errors(path):
-            if checksums and on_first_rank(comm, new.is_own):
+            if checksums:
                 add_checksums(comm, new.path)
                 on_all_ranks(comm, lambda: _force_to_disk(new.path))  # on every node
     except BaseException as error:
         _open.pop(new.name, None)
-        all_raise = comm.size == 1 or isinstance(error, Stopped | WriteError | RunTakenOver)
+        all_raise = comm.size == 1 or isinstance(error, Stopped | WriteError)
         if new.broken or not all_raise or not new.try_to_close():
             _abandoned.append(new)
         else:
             with file_errors(new.path):
-                on_first_rank(comm, new.remove)
+                on_first_rank(comm, lambda: new.path.unlink(missing_ok=True))
         raise
     with file_errors(path):
         on_first_rank(comm, lambda: new.publish(path))
@@ -194,14 +190,13 @@ def frame_bytes(dataset: h5py.Dataset) -> int:
 
 class _NewFile:
     """An HDF5 file that all ranks write together. `reserve`, `close` and `try_to_close` are collective; only rank 0
-    calls `is_own`, `remove` and `publish`."""
+    calls `publish`."""
 
     def __init__(self, comm: MPI.Comm, path: Path) -> None:
         self.comm, self.path, self.broken = comm, path, False
         self._needed, self._reserved = 0, 0
         self._alike(self._make_empty)
         self._alike(self._open_file)
-        self._inode = path.stat().st_ino if comm.rank == 0 else 0
         self.name = self.file.filename
         _open[self.name] = self
 
@@ -230,19 +225,8 @@ class _NewFile:
         self.broken = first_complaint(self.comm, complaint) is not None
         return not self.broken
 
-    def is_own(self) -> bool:
-        """Return whether the file is still the one that this job created."""
-        return self.path.exists() and self.path.stat().st_ino == self._inode
-
-    def remove(self) -> None:
-        """Remove the closed file, if it is still the one that this job created."""
-        if self.is_own():
-            self.path.unlink()
-
     def publish(self, path: Path) -> None:
-        """Give the closed file its final name, `path`. Raises RunTakenOver if it is no longer this job's file."""
-        if not self.is_own():
-            raise RunTakenOver(path)
+        """Give the closed file its final name, `path`."""
         os.replace(self.path, path)
         with suppress(OSError):  # the file is complete; some file systems do not allow fsync of a directory
             _force_to_disk(path.parent)
@@ -253,7 +237,7 @@ class _NewFile:
             empty = io.BytesIO()
             h5py.File(empty, "w").close()
             try:
-                # Make a new inode: another job, or a file left open after an error, may still use the old one.
+                # Make a new inode: a file left open after an error may still use the old one.
                 self.path.unlink(missing_ok=True)
                 self.path.write_bytes(empty.getvalue())
             except OSError:
