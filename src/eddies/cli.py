@@ -96,6 +96,7 @@ def run(arguments: list[str] | None) -> int:
             complain(f"error: {error}")
         return BAD_INPUT
     comm, exit_comm = MPI.COMM_WORLD, MPI.COMM_WORLD.Dup()
+    from eddies.io.new_files import require_parallel_hdf5
     from eddies.parallel.broadcast import require_same
     from eddies.parallel.stop import Stopped
     options = None
@@ -103,6 +104,7 @@ def run(arguments: list[str] | None) -> int:
         require_same(comm, shlex.join(sys.argv[1:] if arguments is None else arguments), "the arguments {}")
         options = parse_arguments(arguments, comm.rank)
         configure_logging(comm.rank, getattr(options, "log", None))
+        require_parallel_hdf5(comm)
         check_threads()
         library()  # sets the threads, which torch shares
         if options.command == "check" and options.time:

@@ -21,7 +21,7 @@ from eddies.io.errors import WriteError
 from eddies.io.hdf5 import in_files, open_product
 from eddies.io.provenance import product_fingerprint
 from eddies.io.run_lock import RunInUse, lock_directory
-from eddies.io.new_files import LARGEST_BYTES, has_single_writer, write_files, writing_failed
+from eddies.io.new_files import write_files, writing_failed
 from eddies.parallel.broadcast import on_first_rank, require_same
 from eddies.logs import OUTCOME
 from eddies.parallel.communicator import Comm, warn_of_few_processors
@@ -30,7 +30,6 @@ from eddies.parallel.reduction import any_rank
 from eddies.parallel.stop import Stopped, StopRequest
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene, SceneError
-from eddies.workflows.foreseen.storage import in_units
 from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.learned.source import ModelDefinition, read_source
 from eddies.workflows.problems import check_ground_truth, directory_problems, memory_of_node, problems
@@ -142,8 +141,6 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
     if step.links:  # the other inputs were checked before the first step
         check_inputs(step, comm)
     work = in_files(comm, directory, lambda: find_work(step.stages, scene, directory, step.links, overwrite))
-    if has_single_writer(comm):
-        log.info("rank 0 writes all files, each at most %s, because this h5py has no MPI", in_units(LARGEST_BYTES))
     if scene.foreign:
         log.info("%s: uses classes from outside this package: %s", scene.name, ", ".join(scene.foreign))
     checked = False  # whether the ground truth was checked for the stages that need it
