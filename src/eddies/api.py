@@ -91,10 +91,9 @@ def _job(comm: Comm | None) -> Iterator[Comm]:
 
     from eddies.io.new_files import require_parallel_hdf5, writing_failed
     from eddies.kernels.library import library
-    from eddies.parallel.connection import all_arrive, require_connected
+    from eddies.parallel.broadcast import all_arrive
     if comm is None:
         comm = MPI.COMM_WORLD
-        require_connected(comm)
     if not logging.getLogger("eddies").hasHandlers():
         configure_logging(comm.rank)
     errors = comm.Dup()

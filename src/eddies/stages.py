@@ -22,10 +22,9 @@ from eddies.io.hdf5 import in_files, open_product
 from eddies.io.provenance import product_fingerprint
 from eddies.io.run_lock import RunInUse, lock_directory
 from eddies.io.new_files import write_files, writing_failed
-from eddies.parallel.broadcast import on_first_rank, require_same
+from eddies.parallel.broadcast import all_arrive, on_first_rank, require_same
 from eddies.logs import OUTCOME
 from eddies.parallel.communicator import Comm, warn_of_few_processors
-from eddies.parallel.connection import all_arrive
 from eddies.parallel.reduction import any_rank
 from eddies.parallel.stop import Stopped, StopRequest
 from eddies.pipeline import STAGES

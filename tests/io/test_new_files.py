@@ -131,7 +131,7 @@ PROGRAM = """
 import resource, sys
 import numpy as np
 from eddies import cli
-from eddies.parallel import connection
+from eddies.parallel import broadcast
 from eddies.io import new_files
 from eddies.io.hdf5 import append_frame, create_product, growing_dataset
 from eddies.workflows import dns
@@ -145,7 +145,7 @@ def run(scene, comm, directory, stop):
                 resource.setrlimit(resource.RLIMIT_FSIZE, (2_500_000 * comm.size, -1))
             append_frame(dataset, np.ones((50000, 3)), (50000 * comm.rank, 0))
 
-dns.run, connection.PATIENCE = run, 0.5
+dns.run, broadcast.PATIENCE = run, 0.5
 sys.exit(cli.main(["dns", "tiny", "--output", sys.argv[1]]))
 """
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -74,8 +73,7 @@ def before_checksums(path: Path) -> bool:
 
 def _print(comm: Comm, line: str) -> None:
     if comm.rank == 0:
-        sys.stdout.write(f"{line}\n")
-        sys.stdout.flush()
+        print(line, flush=True)
 
 
 def status_lines(directory: Path) -> Iterator[str]:
