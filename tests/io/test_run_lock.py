@@ -36,19 +36,22 @@ def test_a_job_holds_its_directory_and_leaves_nothing(comm, tmp_path):
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("line", ["node7, process 4242", f"{HOST}7, process 1", "another program's\nlines", ""])
 def test_the_line_of_another_host_refuses_until_it_is_removed(comm, tmp_path, line):
-    """An empty file, of a job that was killed before it wrote its line, does not."""
+    """Also in the directories of variants. An empty file, of a job that was killed before it wrote its line, does not.
+    """
     run = tmp_path / "my run"
-    run.mkdir()
-    (run / "LOCK").write_text(line)
+    (run / "a").mkdir(parents=True)
+    (run / "b").mkdir()
+    for path, words in ((run, line), (run / "a", line), (run / "b", "node8, process 9")):
+        (path / "LOCK").write_text(words)
     if line:
         with pytest.raises(RunInUse, match="was killed") as refused, lock_directory(comm, run):
             pass
         assert (run / "LOCK").read_text() == line and job_in(run) == f"may be in use by {' '.join(line.split())}"
         command = str(refused.value).split("`")[1]
-        assert command == f"rm '{run}/LOCK'"
+        assert command == f"rm '{run}/LOCK' '{run}/a/LOCK'"
         subprocess.run(command, shell=True, check=True)
     with lock_directory(comm, run):
-        pass
+        assert (run / "b/LOCK").exists()
 
 
 @pytest.mark.mpi(1)

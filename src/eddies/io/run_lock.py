@@ -85,9 +85,10 @@ def _take(directory: Path) -> FileIO:
                            "one job only, MPI does not connect its ranks: use its mpirun, or `srun --mpi=pmix`")
         if not _has_name(file, path):  # the job that held it has just removed it
             return _take(directory)
-        if line and not _has_ended(line, granted):
-            raise RunInUse(f"{directory}: a job still works here, or was killed ({line}); if it no longer runs, "
-                           f"run `rm {shlex.quote(str(path))}`")
+        if line and not _has_ended(line, granted):  # it may also have locked directories of variants
+            left = [str(each) for each in sorted(directory.rglob(LOCK)) if each.read_bytes() == path.read_bytes()]
+            raise RunInUse(f"{directory}: a job still works here, or was killed ({line}); if it no longer runs, run "
+                           f"`rm {shlex.join(left)}`")
         file.truncate(0)
         file.write(_this_job().encode())
         unless_taken.pop_all()
