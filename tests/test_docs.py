@@ -131,7 +131,7 @@ def test_commands_in_the_text_exist():
 def test_options_in_the_text_exist():
     listed = {option for command in build_parser()._subparsers._group_actions[0].choices.values()
               for action in command._actions for option in action.option_strings}
-    for option in re.findall(r"`(--(?:set|output|overwrite|take-over)\b)", TEXT):
+    for option in re.findall(r"`(--(?:set|output|overwrite)\b)", TEXT):
         assert option in listed
     assert all(f"`{option}" in TEXT for option in listed if option.startswith("--") and option != "--help")
 

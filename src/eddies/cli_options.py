@@ -146,8 +146,6 @@ def add_job_options(parser: argparse.ArgumentParser, output: str) -> None:
     parser.add_argument("--output", type=directory, metavar="DIR", help=output)
     parser.add_argument("--overwrite", action="store_true", help="replace products and checkpoints of other settings, "
                         "which are otherwise an error. Work of the same settings is kept and continued")
-    parser.add_argument("--take-over", action="store_true",
-                        help="end another job in the same directory, or remove the lock of a job that has died")
     parser.add_argument("--checkpoint-minutes", type=positive, default=10.0, metavar="M",
                         help="wall time between two checkpoints (default: 10)")
     parser.add_argument("--max-minutes", type=positive, default=math.inf, metavar="M",

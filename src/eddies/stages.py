@@ -20,17 +20,15 @@ from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.errors import WriteError
 from eddies.io.hdf5 import in_files, open_product
 from eddies.io.provenance import product_fingerprint
-from eddies.io.run_lock import RunInUse, RunTakenOver, lock_directory, refuse_if_held
-from eddies.io.new_files import LARGEST_BYTES, has_single_writer, write_files, writing_failed
-from eddies.parallel.broadcast import on_first_rank, require_same
+from eddies.io.run_lock import RunInUse, lock_directory
+from eddies.io.new_files import write_files, writing_failed
+from eddies.parallel.broadcast import all_arrive, on_first_rank, require_same
 from eddies.logs import OUTCOME
 from eddies.parallel.communicator import Comm, warn_of_few_processors
-from eddies.parallel.connection import all_arrive
 from eddies.parallel.reduction import any_rank
 from eddies.parallel.stop import Stopped, StopRequest
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene, SceneError
-from eddies.workflows.foreseen.storage import in_units
 from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.learned.source import ModelDefinition, read_source
 from eddies.workflows.problems import check_ground_truth, directory_problems, memory_of_node, problems
@@ -46,19 +44,19 @@ class VariantsFailed(UserError):
 
 
 def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path, stop: StopRequest,
-               overwrite: bool = False, take_over: bool = False, variants: Sequence[str] = ()) -> None:
+               overwrite: bool = False, variants: Sequence[str] = ()) -> None:
     """Run stages of a scene, for all its variants or those named in `variants`; all ranks call it.
 
     A stage is skipped if its product is complete and was made with the same settings. Otherwise it continues from a
     checkpoint of the same settings, if there is one. Work of other settings is replaced only if `overwrite` is true.
-    The wall time of each stage is recorded in stage_seconds.json. A lock keeps other jobs out of the directory. If
-    `take_over` is true, a job that holds the lock is ended. The failure of a variant does not stop the other variants.
+    The wall time of each stage is recorded in stage_seconds.json. A lock keeps other jobs out of the directory. The
+    failure of a variant does not stop the other variants.
 
     Raises:
         Stopped: `stop` asked the job to end; the running stage has stored what the next run needs.
         SceneError: a file STOP is present at the start, or the scene lacks a section, cannot use this number of ranks,
             needs a file that is too large for rank 0 to write, or has settings that differ from those of an input.
-        RunInUse, RunTakenOver: another job works in the directory, or has taken it over.
+        RunInUse: another job works in the directory.
         WouldReplaceWork: work of other settings would be replaced.
         WriteError: the directory cannot be written.
         ProductError: an input is missing that `stages` do not make.
@@ -81,23 +79,15 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     refused, warnings = problems(scene, planned, comm, memory_of_node(comm))
     for problem in [*refused, *(directory_problems(("report",), comm, directory) if reported else ())]:
         raise SceneError(problem)
-
-    def refuse_to_lose() -> None:
-        for step in planned:
-            in_files(comm, step.directory, partial(
-                find_work, step.stages, step.scene, step.directory, step.links, overwrite))
-
-    if take_over:
-        refuse_to_lose()  # before another job is ended
-    else:
-        refuse_if_held(comm, directory)
     made = {file for step in planned for file in step.files}
     for step in planned:
         check_inputs(step, comm, made)
     if on_first_rank(comm, lambda: os.path.exists(directory / "STOP")):  # ends a chain of jobs that resubmit themselves
         raise SceneError(f"{directory / 'STOP'}: asks the job to stop before it begins; remove the file to continue")
-    with working_in(comm, directory, stop, take_over):
-        refuse_to_lose()
+    with lock_directory(comm, directory):
+        for step in planned:
+            in_files(comm, step.directory, partial(
+                find_work, step.stages, step.scene, step.directory, step.links, overwrite))
         prepare_directory(scene.to_toml(), comm, directory)
         for warning in warnings if comm.rank == 0 else ():
             log.warning(warning)
@@ -109,7 +99,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
                 log.info("%s, part %d of %d: %s", step.directory, number, len(planned), ", ".join(step.stages))
             inner = step.directory != directory  # this directory has a lock of its own
             with (recording_failure(failures, step.variant, step.directory, comm),
-                  working_in(comm, step.directory, stop, take_over) if inner else nullcontext()):
+                  lock_directory(comm, step.directory) if inner else nullcontext()):
                 if inner:
                     linked = {holder / STAGES[stage].file: stage_fingerprint(step.scene, stage)
                               for stage, holder in step.links.items()}
@@ -133,7 +123,7 @@ def recording_failure(failures: dict[str, str], variant: str | None, directory: 
     errors = comm.Dup()  # other ranks may wait in `comm` for a message when one rank fails
     try:
         yield
-    except (WriteError, RunInUse, RunTakenOver):  # these concern all variants
+    except (WriteError, RunInUse):  # these concern all variants
         raise
     except UserError as error:
         if variant is None or not all_arrive(errors) or any_rank(errors, writing_failed()):
@@ -150,8 +140,6 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
     if step.links:  # the other inputs were checked before the first step
         check_inputs(step, comm)
     work = in_files(comm, directory, lambda: find_work(step.stages, scene, directory, step.links, overwrite))
-    if has_single_writer(comm):
-        log.info("rank 0 writes all files, each at most %s, because this h5py has no MPI", in_units(LARGEST_BYTES))
     if scene.foreign:
         log.info("%s: uses classes from outside this package: %s", scene.name, ", ".join(scene.foreign))
     checked = False  # whether the ground truth was checked for the stages that need it
@@ -173,14 +161,6 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
             check_ground_truth(directory / STAGES["dns"].file, later, scene.simulation, check, comm)
             checked = True
         run_stage(name, (scene, comm, directory, stop), comm, directory, stop, course.start == "continue")
-
-
-@contextmanager
-def working_in(comm: Comm, directory: Path, stop: StopRequest, take_over: bool) -> Iterator[None]:
-    """Context that holds the lock of a directory. If another job takes over the directory, the next call of `stop`
-    raises an error, which ends this job."""
-    with lock_directory(comm, directory, take_over) as lock_lost, stop.watching(lock_lost):
-        yield
 
 
 def run_stage(name: str, arguments: Sequence[Any], comm: Comm, directory: Path, stop: StopRequest,

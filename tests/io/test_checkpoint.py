@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
-import h5py
 import numpy as np
 import pytest
 
@@ -47,10 +46,8 @@ def fill(comm, path, steps, fingerprint="settings"):
 
 
 @pytest.mark.mpi(1, 3)
-@pytest.mark.parametrize("mpi", [True, False])
-def test_what_is_read_is_what_was_written(comm, tmp_path, monkeypatch, mpi):
-    """Also if rank 0 writes for all. The numbers that are no blocks are those of rank 0."""
-    monkeypatch.setattr(h5py, "get_config", lambda: SimpleNamespace(mpi=mpi))
+def test_what_is_read_is_what_was_written(comm, tmp_path):
+    """The numbers that are no blocks are those of rank 0."""
     saved = fill(comm, tmp_path, [200]).newest()
     _, modes, rows = arrays(comm, 200)
     assert (saved["time"], saved["end"]) == (200 / 3, np.inf) and saved.files == []

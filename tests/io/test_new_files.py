@@ -1,4 +1,4 @@
-"""Files are complete or absent: on full disks, with one writer for all ranks, and after errors."""
+"""Files are complete or absent: on full disks, and after errors."""
 
 import errno
 import os
@@ -6,11 +6,13 @@ import stat
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
 import pytest
 
+import eddies
 from eddies.errors import UserError
 from eddies.io import new_files
 from eddies.io.checksums import FOOTER, find_damage, open_to_read, table_checksum
@@ -20,12 +22,9 @@ from eddies.io.hdf5 import (append_frame, create_product, growing_dataset, in_fi
                             write_table)
 from eddies.io.new_files import MARGIN_BYTES, write_files
 from eddies.io.trajectories import TrajectoryWriter
-from eddies.parallel.stop import StopRequest
-from eddies.scene.scene import load_scene
-from eddies.stages import run_stages
 from mpi_tools.launch import mpi_environment, mpirun_command
+from tests.commands import refused, run_cli
 from tests.full_disk import largest_file
-from tests.small_scene import TINY, problems_of
 
 SIZES = 2**12, 5 * 2**20 + 1  # of the largest file: at the beginning, and in the frames
 
@@ -48,23 +47,15 @@ def write(comm, path, frames=4):
         write_table(file, "statistics", {"time": np.arange(1000.0), "nothing": np.zeros((0, 2))})
 
 
-@pytest.fixture
-def serial(monkeypatch):
-    """A function after which h5py seems to be built without MPI."""
-    return lambda: monkeypatch.setattr(h5py, "get_config", lambda: type("Configuration", (), {"mpi": False}))
-
-
 @pytest.mark.mpi(1, 2, 3, timeout=60)
-def test_a_full_disk_is_told_and_harms_nothing(comm, tmp_path, serial):
-    """The last rank alone meets the limit; then rank 0, which writes for all."""
+def test_a_full_disk_is_told_and_harms_nothing(comm, tmp_path):
+    """The last rank alone meets the limit."""
     path = tmp_path / "rollout.h5"
     if comm.rank == 0:
         path.write_text("older")
     comm.Barrier()
-    for size, rank in (*((size, comm.size - 1) for size in SIZES), (SIZES[-1], 0)):
-        if rank == 0:
-            serial()
-        with largest_file(comm, size, rank):
+    for size in SIZES:
+        with largest_file(comm, size, comm.size - 1):
             with pytest.raises(WriteError, match=r"rollout.h5.partial: .*: \d+ bytes wanted, \d+ free; make room"):
                 write(comm, path)
         assert path.read_text() == "older" and [file.name for file in tmp_path.iterdir()] == ["rollout.h5"]
@@ -140,7 +131,7 @@ PROGRAM = """
 import resource, sys
 import numpy as np
 from eddies import cli
-from eddies.parallel import connection
+from eddies.parallel import broadcast
 from eddies.io import new_files
 from eddies.io.hdf5 import append_frame, create_product, growing_dataset
 from eddies.workflows import dns
@@ -154,7 +145,7 @@ def run(scene, comm, directory, stop):
                 resource.setrlimit(resource.RLIMIT_FSIZE, (2_500_000 * comm.size, -1))
             append_frame(dataset, np.ones((50000, 3)), (50000 * comm.rank, 0))
 
-dns.run, connection.PATIENCE = run, 0.5
+dns.run, broadcast.PATIENCE = run, 0.5
 sys.exit(cli.main(["dns", "tiny", "--output", sys.argv[1]]))
 """
 
@@ -256,50 +247,17 @@ def test_an_unknown_size_is_not_told(tmp_path):
     assert "wanted" not in str(write_error(tmp_path / "a", full))
 
 
-def content(path):
-    """Datasets and attributes of all groups by path."""
-    found = {}
-
-    def read(name, item):
-        found.update({(name, key): np.array(value) for key, value in item.attrs.items()})
-        if isinstance(item, h5py.Dataset):
-            found[name] = item[()]
-
-    with h5py.File(path) as file:
-        file.visititems(read)
-    return found
-
-
-@pytest.mark.mpi(3)
-def test_a_single_writer_makes_the_same_product(comm, tmp_path, serial):
-    """Also of blocks that are cut along the last axis, of which rank 0 has none, and then all."""
-    cuts = [0, 0, 3, 4]
-    mine = slice(cuts[comm.rank], cuts[comm.rank + 1])
-    for name in ("parallel", "serial"):
-        write(comm, tmp_path / f"{name}.h5", 2)
-        with create_product(comm, tmp_path / f"parts-{name}.h5", "frames", {}) as file:
-            dataset = growing_dataset(file, "values", (2, 3, 4), np.float64)
-            append_frame(dataset, np.arange(24.0).reshape(2, 3, 4)[:, :, mine], (0, 0, mine.start))
-            append_frame(dataset, np.ones((2, 3, 4 if comm.rank == 0 else 0)), (0, 0, 0))
-        serial()  # from the second on
-    for name in ("", "parts-"):
-        expected, found = content(tmp_path / f"{name}parallel.h5"), content(tmp_path / f"{name}serial.h5")
-        assert list(found) == list(expected)
-        assert all(np.array_equal(found[path], values) for path, values in expected.items())
-    assert np.array_equal(found["values"][0].ravel(), np.arange(24)) and not list(tmp_path.glob("*.partial"))
-
-
-@pytest.mark.mpi(2)
-def test_what_is_too_large_for_a_single_writer_is_refused(comm, tmp_path, serial):
-    scene = load_scene("hit-paper", ["flow.cells=512"])
-    assert not any("h5py has no MPI" in line for line in problems_of(scene, comm)[0])
-    serial()
-    line, *_ = problems_of(scene, comm)[0]
-    assert "ground_truth.h5: " in line and "h5py has no MPI" in line and "4 GB" in line
-    assert problems_of(load_scene(TINY), comm)[0] == []
-    with pytest.raises(UserError, match="ground_truth.h5: .* HDF5_MPI=ON"):
-        run_stages(["dns"], scene, comm, tmp_path / "run", StopRequest(comm))
-    assert not (tmp_path / "run").exists()
+@pytest.mark.mpi(1, 2)
+def test_several_ranks_need_an_h5py_with_mpi(comm, tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr(h5py, "get_config", lambda: SimpleNamespace(mpi=False))
+    command = ["dns", "abc", "--set", "time.duration=0.1", "--output", tmp_path / "run"]
+    if comm.size == 1:
+        assert run_cli(*command) == 0 and (tmp_path / "run/ground_truth.h5").exists()
+    else:
+        refused(comm, capfd, command, "2 ranks need an h5py with MPI", "mpi_tools/bootstrap.sh", "HDF5_MPI=ON")
+        with pytest.raises(UserError, match="an h5py with MPI"):
+            eddies.run("abc", output=tmp_path / "run", comm=comm)
+        assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.mpi(1, 2)

@@ -2,18 +2,15 @@
 
 import re
 import shutil
-import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
-from mpi_tools.launch import mpi_environment
 from tests.jobs.slurm import Slurm, missing
 
 CHECKOUT = Path(__file__).parents[2]
-EDDIES = Path(sys.executable).with_name("eddies")
 STEPS, STEP = 40, 0.001
 pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
 
@@ -88,26 +85,3 @@ def test_job_that_is_submitted_elsewhere_names_the_remedy(slurm):
     known, output = end(slurm, job)
     assert known["ExitCode"] == "2:0"
     assert f"{slurm.folder}/jobs/run.sh" in output and "EDDIES_CHECKOUT" in output
-
-
-def test_ranks_that_slurm_does_not_connect_are_refused_and_no_others(slurm, tmp_path):
-    # Open MPI ends by itself in a step that does not connect it. If the number of the step is unset it starts, as other
-    # MPIs do, each rank on its own.
-    script = tmp_path / "script"
-    script.write_text(f"""#!/bin/bash
-eddies='{EDDIES}'
-srun() {{ command srun --ntasks=2 --exact "$@"; }}
-alone=(srun --mpi=none env -u SLURM_STEPID -u SLURM_STEP_ID "$eddies")
-{{ "${{alone[@]}}" run abc --output '{tmp_path}/run'; echo "none $?"; }} &
-"$eddies" scenes abc > /dev/null; echo "in the script $?"
-mpirun -n 2 "$eddies" scenes abc > /dev/null; echo "mpirun in the script $?"
-srun --mpi=none mpirun -n 1 "$eddies" scenes abc > /dev/null; echo "mpirun in a step $?"
-srun --mpi=pmix "$eddies" scenes abc > /dev/null; echo "pmix $?"
-wait
-""")
-    _, output = end(slurm, slurm.submit("--ntasks=4", script, **mpi_environment(2)))
-    said = sorted(line for line in output.splitlines() if not line.startswith("srun: "))
-    assert [line for line in said if not line.startswith("eddies: ")] == [
-        "in the script 0", "mpirun in a step 0", "mpirun in the script 0", "none 2", "pmix 0"], output
-    assert "2 ranks were started (SLURM_STEP_NUM_TASKS)" in said[0] and "srun --mpi=pmix" in said[0]
-    assert len(said) == 6 and not (tmp_path / "run").exists()

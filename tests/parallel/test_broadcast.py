@@ -3,7 +3,8 @@
 import pytest
 
 from eddies.errors import UserError
-from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank, require_same
+from eddies.parallel import broadcast
+from eddies.parallel.broadcast import all_arrive, first_complaint, on_all_ranks, on_first_rank, require_same
 from eddies.scene.values import KeyProblem, SceneError
 
 pytestmark = pytest.mark.mpi(1, 3)
@@ -47,3 +48,15 @@ def test_ranks_that_were_started_differently_are_refused(comm):
     if comm.size > 1:
         with pytest.raises(UserError, match="rank 2 was started with scene other, rank 0 with scene tiny"):
             require_same(comm, "other" if comm.rank == 2 else "tiny", "scene {}")
+
+
+def test_a_rank_does_not_wait_for_ever_for_the_others(comm, monkeypatch):
+    own, last = comm.Dup(), comm.rank == comm.size - 1
+    assert all_arrive(own)
+    monkeypatch.setattr(broadcast, "PATIENCE", 0.1)
+    if not last:
+        assert not all_arrive(own)
+    comm.Barrier()
+    if last:
+        own.Ibarrier().Wait()  # so that no message stays under way
+    comm.Barrier()

@@ -25,7 +25,7 @@ PLACES = {
     "transform": (eddies.spectral.fourier_passes.PlanePass, "to_physical", 50),  # between two transposes
     "halo": (eddies.parallel.halo.PlaneHalo, "forward", 2),
     "product": (eddies.io.hdf5, "frame_bytes", 15),  # before a collective write: the second frame
-    "checkpoint": (eddies.io.checkpoint, "own_part", 45),  # half of the second checkpoint is written
+    "checkpoint": (eddies.io.checkpoint, "write_block", 45),  # half of the second checkpoint is written
 }
 
 KINDS = {"RuntimeError": RuntimeError, "MemoryError": MemoryError, "SystemExit": SystemExit,

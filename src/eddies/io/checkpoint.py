@@ -28,7 +28,7 @@ from eddies.io.checksums import find_damage, open_to_read, table_checksum
 from eddies.io.errors import ContentError, ProductError, WriteError, read_errors
 from eddies.io.frame_segments import FrameSegments
 from eddies.io.hdf5 import in_files, write_block
-from eddies.io.new_files import HEADER_BYTES, new_file, own_part, writing
+from eddies.io.new_files import HEADER_BYTES, new_file, writing
 from eddies.kernels.library import in_use
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.stop import Stopped, StopRequest
@@ -245,7 +245,7 @@ def _write_array(file: h5py.File, name: str, block: Block) -> None:
     """Write a global array from the blocks of all ranks.
 
     If `axis` is not the first axis, one index of the first axis is written at a time. This keeps each written part
-    small: MPI counts its bytes in 32 bits, and a single writer holds it in memory.
+    small: MPI counts its bytes in 32 bits.
     """
     values, axis = block.values, block.axis
     shape = (*values.shape[:axis], block.total, *values.shape[axis + 1:])
@@ -255,6 +255,5 @@ def _write_array(file: h5py.File, name: str, block: Block) -> None:
         return  # HDF5 does not write an empty dataset collectively
     for lead in np.ndindex(shape[:min(axis, 1)]):
         offset = (0,) * (axis - len(lead)) + (block.start,) + (0,) * (values.ndim - axis - 1)
-        part, offset = own_part(file, shape[len(lead):], np.ascontiguousarray(values[lead]), offset)
         with writing(file, 0):
-            write_block(dataset, part[(None,) * len(lead)], (*lead, *offset))
+            write_block(dataset, np.ascontiguousarray(values[lead])[(None,) * len(lead)], (*lead, *offset))

@@ -17,7 +17,7 @@ from mpi4py import MPI
 
 from eddies.io.checksums import ATTRIBUTE, WORDS, open_to_read
 from eddies.io.errors import ProductError, file_errors, read_errors, remedy_for
-from eddies.io.new_files import HEADER_BYTES, frame_bytes, new_file, own_part, writing
+from eddies.io.new_files import HEADER_BYTES, frame_bytes, new_file, writing
 from eddies.io.provenance import FORMAT, environment, has_this_format, product_ids, read_json, read_provenance
 from eddies.io.quantities import conventions, describe, python_value
 from eddies.parallel.broadcast import on_all_ranks, on_first_rank
@@ -148,8 +148,7 @@ def growing_dataset(group: h5py.Group, name: str, frame_shape: tuple[int, ...], 
 
 def append_frame(dataset: h5py.Dataset, block: np.ndarray, offset: tuple[int, ...]) -> None:
     """Add a frame to a growing dataset. This rank writes `block`, which may be empty, at `offset`; collective."""
-    frame = dataset.shape[0]
-    block, offset = own_part(dataset, dataset.shape[1:], np.asarray(block, dataset.dtype, order="C"), offset)
+    frame, block = dataset.shape[0], np.asarray(block, dataset.dtype, order="C")
     with writing(dataset, frame_bytes(dataset)):
         dataset.resize(frame + 1, axis=0)
         write_block(dataset, block[None], (frame, *offset))

@@ -7,18 +7,13 @@ leaves the former file as it was. There are two ways to write:
 - `new_file`: an HDF5 file, by all ranks together; `create_export` uses it for files that other programs read.
 
 HDF5 does not survive a write that fails: it crashes when it closes the file, or ranks wait for each other for ever.
-Measures 1 and 2 prevent this. Measure 3 is for an h5py that was built without MPI, as the wheels of h5py are:
+Two measures prevent this:
 
 1. Each write is announced by `writing`, which reserves the space on the disk first. If there is too little, all ranks
    raise WriteError before HDF5 writes; the file can then be closed and removed. A margin stays reserved for what HDF5
    writes at the end.
 2. If a write fails nevertheless, or one of several ranks raises an exception that the others may not know of, the file
    is left open, as NAME.partial, and the job is aborted.
-3. Without MPI in h5py, rank 0 writes for all: `own_part` sends it the blocks of the other ranks. The other ranks have
-   a file in memory with the same groups, attributes and shapes, so callers see no difference.
-
-A job may lose its run directory to another job (io/run_lock.py), which then writes a NAME.partial of its own. So a job
-renames or removes a file only if it is still the file that this job created.
 """
 
 from __future__ import annotations
@@ -38,18 +33,14 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
+from eddies.errors import UserError
 from eddies.io.checksums import add_checksums
 from eddies.io.errors import ProductError, WriteError, file_errors, space_in_words
-from eddies.io.run_lock import RunTakenOver
 from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank
 from eddies.parallel.stop import Stopped
 
 # Upper limits of the bytes that HDF5 adds to the values: for a dataset, for a chunk, and when it closes a file.
 HEADER_BYTES, INDEX_BYTES, MARGIN_BYTES = 2**14, 2**8, 2**19
-# Largest product if rank 0 writes for all. Rank 0 then holds one frame in memory, and the other ranks wait.
-LARGEST_BYTES = 4 * 10**9
-REMEDY = ("run on one rank, or build h5py with MPI: `CC=mpicc HDF5_MPI=ON pip install --no-binary=h5py "
-          "--no-build-isolation h5py`")
 
 Layout = Mapping[str, tuple[tuple[int, ...], Any]]  # shape and type of each large dataset, by its path
 
@@ -94,17 +85,17 @@ def new_file(comm: MPI.Comm, path: Path, checksums: bool = True) -> Iterator[h5p
         with writing(new.file, 0):
             new.close()
         with file_errors(path):
-            if checksums and on_first_rank(comm, new.is_own):
+            if checksums:
                 add_checksums(comm, new.path)
                 on_all_ranks(comm, lambda: _force_to_disk(new.path))  # on every node
     except BaseException as error:
         _open.pop(new.name, None)
-        all_raise = comm.size == 1 or isinstance(error, Stopped | WriteError | RunTakenOver)
+        all_raise = comm.size == 1 or isinstance(error, Stopped | WriteError)
         if new.broken or not all_raise or not new.try_to_close():
             _abandoned.append(new)
         else:
             with file_errors(new.path):
-                on_first_rank(comm, new.remove)
+                on_first_rank(comm, lambda: new.path.unlink(missing_ok=True))
         raise
     with file_errors(path):
         on_first_rank(comm, lambda: new.publish(path))
@@ -152,36 +143,12 @@ def writing_failed() -> bool:
     return any(new.broken for new in _abandoned)
 
 
-def has_single_writer(comm: MPI.Comm) -> bool:
-    """Return whether rank 0 writes for several ranks, because h5py is built without MPI."""
-    return comm.size > 1 and not h5py.get_config().mpi
-
-
-def own_part(group: h5py.Group | h5py.Dataset, shape: tuple[int, ...], block: np.ndarray,
-             offset: tuple[int, ...]) -> tuple[np.ndarray, tuple[int, ...]]:
-    """Return the part of an array of this `shape` that this rank writes, and the offset of the part; collective.
-
-    The part is this rank's `block` at `offset`. If rank 0 writes for all ranks, the part is the whole array on rank 0
-    and empty on the other ranks.
-    """
-    comm = _open[group.file.filename].comm
-    if not has_single_writer(comm) or not shape:
-        return block, offset
-    places = np.empty((comm.size, 2, len(shape)), np.int64)
-    comm.Gather(np.array([offset, block.shape], np.int64), places)
-    start = (0,) * len(shape)
-    if comm.rank > 0:
-        if block.size:
-            comm.Send(block, 0)
-        return np.empty(start, block.dtype), start
-    whole = np.zeros(shape, block.dtype)
-    for rank, (begin, extent) in enumerate(places):
-        if extent.all():
-            part = block if rank == 0 else np.empty(extent, block.dtype)
-            if rank > 0:
-                comm.Recv(part, rank)
-            whole[tuple(map(slice, begin, begin + extent))] = part
-    return whole, start
+def require_parallel_hdf5(comm: MPI.Comm) -> None:
+    """Raise UserError if there are several ranks and h5py was built without MPI, as its wheels are."""
+    if comm.size > 1 and not h5py.get_config().mpi:
+        raise UserError(f"{comm.size} ranks need an h5py with MPI, and this one has none; run mpi_tools/bootstrap.sh, "
+                        "or `CC=mpicc HDF5_MPI=ON pip install --no-binary=h5py --no-build-isolation h5py`; one rank "
+                        "works with any h5py")
 
 
 def frame_bytes(dataset: h5py.Dataset) -> int:
@@ -194,14 +161,13 @@ def frame_bytes(dataset: h5py.Dataset) -> int:
 
 class _NewFile:
     """An HDF5 file that all ranks write together. `reserve`, `close` and `try_to_close` are collective; only rank 0
-    calls `is_own`, `remove` and `publish`."""
+    calls `publish`."""
 
     def __init__(self, comm: MPI.Comm, path: Path) -> None:
         self.comm, self.path, self.broken = comm, path, False
         self._needed, self._reserved = 0, 0
         self._alike(self._make_empty)
         self._alike(self._open_file)
-        self._inode = path.stat().st_ino if comm.rank == 0 else 0
         self.name = self.file.filename
         _open[self.name] = self
 
@@ -230,19 +196,8 @@ class _NewFile:
         self.broken = first_complaint(self.comm, complaint) is not None
         return not self.broken
 
-    def is_own(self) -> bool:
-        """Return whether the file is still the one that this job created."""
-        return self.path.exists() and self.path.stat().st_ino == self._inode
-
-    def remove(self) -> None:
-        """Remove the closed file, if it is still the one that this job created."""
-        if self.is_own():
-            self.path.unlink()
-
     def publish(self, path: Path) -> None:
-        """Give the closed file its final name, `path`. Raises RunTakenOver if it is no longer this job's file."""
-        if not self.is_own():
-            raise RunTakenOver(path)
+        """Give the closed file its final name, `path`."""
         os.replace(self.path, path)
         with suppress(OSError):  # the file is complete; some file systems do not allow fsync of a directory
             _force_to_disk(path.parent)
@@ -253,7 +208,7 @@ class _NewFile:
             empty = io.BytesIO()
             h5py.File(empty, "w").close()
             try:
-                # Make a new inode: another job, or a file left open after an error, may still use the old one.
+                # Make a new inode: a file left open after an error may still use the old one.
                 self.path.unlink(missing_ok=True)
                 self.path.write_bytes(empty.getvalue())
             except OSError:
@@ -262,14 +217,12 @@ class _NewFile:
 
     def _open_file(self) -> None:
         self._stream: BinaryIO | None = None
-        if self.comm.size > 1 and not has_single_writer(self.comm):
+        if self.comm.size > 1:
             self.file = h5py.File(self.path, "r+", driver="mpio", comm=self.comm)
-        elif self.comm.rank == 0:
+        else:
             # With a file object of Python, HDF5 uses no file lock, which some network file systems lack.
             self._stream = open(self.path, "r+b")
             self.file = h5py.File(self._stream, "r+")
-        else:
-            self.file = h5py.File(self.path, "w", driver="core", backing_store=False)
 
     def _reserve_until(self, stop: int) -> None:
         limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]  # of this process

@@ -1,286 +1,139 @@
 """One job at a time in a run directory.
 
-A file LOCK names the job that works there, as JSON. The modification time of LOCK is the job's last sign of life; a
-thread of the job renews it. A job holds the directory as long as LOCK names this job. If LOCK names another job or is
-gone, the job ends.
+Rank 0 of a job holds a lock of the system, flock, on the file LOCK. The system frees it when the process ends, even if
+it is killed. A line in LOCK names host, process and Slurm job. A job that ends in order removes LOCK.
+
+On parallel file systems flock may hold on one host only. So a job is also refused if LOCK has the line of another host,
+until the user removes LOCK. If a file system has no flock, users expect eddies to work nevertheless: a warning says so,
+and any line in LOCK refuses other jobs.
 """
 
 from __future__ import annotations
 
 import contextlib
-import datetime
-import json
+import errno
+import fcntl
 import logging
 import os
+import shlex
 import socket
-import tempfile
-import threading
-import time
-import uuid
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from io import FileIO
 from pathlib import Path
 
 from mpi4py import MPI
 
-from eddies.clock import duration
 from eddies.errors import UserError
-from eddies.io.errors import NO_ROOM, WriteError, file_errors, write_error
+from eddies.io.errors import NO_ROOM, WriteError, write_error
 from eddies.parallel.broadcast import on_first_rank
-from eddies.parallel.stop import LOOK_SECONDS, LockLoss
 
 log = logging.getLogger("eddies")
 
 LOCK = "LOCK"
-SIGN_SECONDS = 30.0
-STALE_SECONDS = 300.0  # ten missed signs of life, because a file system may hang for a while
-SETTLE_SECONDS = 0.5  # within this time, other jobs that have found the same stale lock replace it, too
-UNREADABLE = "unknown"
+UNSUPPORTED = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # what flock reports on a file system without locks
 
 
 class RunInUse(UserError):
     """Another job works in a run directory."""
 
 
-class RunTakenOver(UserError):
-    """Another job has taken over the run directory of this job; raised on all ranks."""
-
-    def __init__(self, path: Path, by: str = "") -> None:
-        super().__init__(f"{path}: another job has taken over this run directory{by}; this job ends and leaves all "
-                         "files as they are")
-
-
-@dataclass(frozen=True)
-class Holder:
-    """The job that holds a run directory, and the process of its first rank."""
-
-    job: str  # a unique name
-    host: str
-    machine: str  # boot id of the machine, and process namespace; empty if unknown
-    pid: int
-    born: str  # start time of the process, in clock ticks since the boot; empty if unknown
-    batch: str  # number of the Slurm job, or empty
-    restarts: int  # how often Slurm has requeued this job
-    start: str  # when the job took the directory, UTC
-
-    @classmethod
-    def this_job(cls) -> Holder:
-        """Return the `Holder` for the job of this process."""
-        restarts = os.environ.get("SLURM_RESTART_COUNT", "")
-        return cls(uuid.uuid4().hex, socket.gethostname(), _machine(), os.getpid(), _born(os.getpid()),
-                   os.environ.get("SLURM_JOB_ID", ""), int(restarts) if restarts.isdecimal() else 0,
-                   datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"))
-
-    def lives(self) -> bool | None:
-        """Return whether the job still runs; None if this cannot be known here.
-
-        This is known on the machine of the job. A requeued Slurm job also knows that its earlier run has ended.
-        """
-        own = self.this_job()
-        if self.batch and self.batch == own.batch and self.restarts < own.restarts:
-            return False
-        if not self.machine or self.machine != own.machine:
-            return None
-        born = _born(self.pid)
-        try:
-            os.kill(self.pid, 0)
-        except ProcessLookupError:
-            return False
-        except PermissionError:  # a process of another user, which /proc may hide
-            if not born:
-                return True
-        return born == self.born if self.born else None  # the pid may belong to another process by now
-
-    def __str__(self) -> str:
-        return f"process {self.pid} on {self.host}, since {self.start}"
-
-
-@dataclass(frozen=True)
-class FoundLock:
-    """A lock in a directory. `sign` is the time of the last sign of life by the clock of the file system."""
-
-    holder: Holder
-    directory: Path
-    sign: float
-
-    @property
-    def silent(self) -> float:
-        """Seconds since the last sign of life of the job that holds the lock."""
-        return _now(self.directory) - self.sign
-
-    @property
-    def stale(self) -> bool:
-        """Whether the job has ended or, if that is unknown, has given no sign of life for STALE_SECONDS."""
-        lives = self.holder.lives()
-        return self.silent > STALE_SECONDS if lives is None else not lives
-
-
-class RunLock:
-    """The lock that this job holds, on rank 0. A thread gives signs of life. `made` says whether the job has made the
-    directory; `release` then removes the directory, unless it holds files."""
-
-    def __init__(self, directory: Path, holder: Holder, made: bool) -> None:
-        self.directory, self.path, self.holder, self.made = directory, directory / LOCK, holder, made
-        self._next_look = 0.0
-        self._lost: RunTakenOver | None = None
-        self._ended = threading.Event()
-        self._signs = threading.Thread(target=self._give_signs, name="run lock", daemon=True)
-        self._signs.start()
-
-    def lock_lost(self) -> RunTakenOver | None:
-        """Return the error to raise if another job has taken over the directory, else None. LOCK is read at most once a
-        second."""
-        now = time.monotonic()
-        if self._lost is None and now >= self._next_look:
-            self._next_look = now + LOOK_SECONDS
-            with contextlib.suppress(OSError):  # the file system fails for a while: nothing is known
-                found = find_lock(self.directory)
-                if found is None:
-                    self._lost = RunTakenOver(self.directory, ", or has removed its LOCK")
-                elif found.holder.job not in (self.holder.job, UNREADABLE):
-                    self._lost = RunTakenOver(self.directory, f" ({found.holder})")
-        return self._lost
-
-    def release(self) -> None:
-        """Remove the lock, unless it belongs to another job."""
-        self._ended.set()
-        self._signs.join()
-        if _is_held_by(self.path, self.holder):
-            self.path.unlink(missing_ok=True)
-        if self.made:
-            with contextlib.suppress(OSError):  # the directory holds files
-                self.directory.rmdir()
-
-    def _give_signs(self) -> None:
-        while not self._ended.wait(SIGN_SECONDS):
-            with contextlib.suppress(OSError):  # the file system fails for a while; the next sign may succeed
-                if _is_held_by(self.path, self.holder):
-                    os.utime(self.path)
-
-
 @contextlib.contextmanager
-def lock_directory(comm: MPI.Comm, directory: Path, take_over: bool = False) -> Iterator[LockLoss]:
+def lock_directory(comm: MPI.Comm, directory: Path) -> Iterator[None]:
     """Hold a run directory inside the block; collective. The directory is made if it is missing.
 
-    Yields `RunLock.lock_lost` on rank 0, and on other ranks a function that returns None. A stale lock is replaced.
-    With `take_over`, any lock is replaced; the job that held the directory then ends at its next step.
-
     Raises:
-        RunInUse: another job works there.
+        RunInUse: another job works there, or may work there on another host.
         WriteError: the directory cannot be written.
     """
-    locks: list[RunLock] = []  # on rank 0
+    locks: list[FileIO] = []  # on rank 0
     try:
-        on_first_rank(comm, lambda: locks.append(_take(directory, take_over)))
+        on_first_rank(comm, lambda: locks.append(_take(directory)))
     except OSError as error:
         raise write_error(directory, error) if error.errno in NO_ROOM else WriteError(
             f"{directory}: cannot be written ({error.strerror}); choose another --output") from None
     try:
-        yield locks[0].lock_lost if locks else lambda: None
+        yield
     finally:
         for lock in locks:
-            with contextlib.suppress(OSError):  # the lock becomes stale by itself
-                lock.release()
+            with contextlib.suppress(OSError), lock:  # the next job on this host takes a LOCK that is left
+                if _has_name(lock, directory / LOCK):
+                    (directory / LOCK).unlink()
 
 
-def refuse_if_held(comm: MPI.Comm, directory: Path) -> None:
-    """Raise RunInUse if another job works in a run directory; collective. Changes nothing."""
-    with file_errors(directory):
-        on_first_rank(comm, lambda: _refuse(directory, find_lock(directory)))
-
-
-def find_lock(directory: Path) -> FoundLock | None:
-    """Return the lock in a directory, or None; OSError if the file system fails."""
-    path = directory / LOCK
+def job_in(directory: Path) -> str:
+    """Return, in words, which job works in a directory; empty if none does. OSError if the file system fails."""
     try:
-        return FoundLock(_read(path), directory, path.stat().st_mtime)
+        with open(directory / LOCK, "rb", buffering=0) as file:
+            granted, line = _lock(file, fcntl.LOCK_SH), _read(file)
     except (FileNotFoundError, NotADirectoryError):
-        return None
+        return ""
+    if granted is False:
+        return f"in use by {line}"
+    return f"may be in use by {line}" if line and not _has_ended(line, granted) else ""
 
 
-def _refuse(directory: Path, found: FoundLock | None) -> None:
-    if found is not None and not found.stale:
-        raise RunInUse(f"{directory}: another job works here ({found.holder}; its last sign of life was "
-                       f"{duration(max(found.silent, 0))} ago); wait until it ends, make a file STOP in the "
-                       "directory to stop it, or choose another --output; if the job has died, add --take-over")
-
-
-def _take(directory: Path, take_over: bool) -> RunLock:
-    holder, found, path = Holder.this_job(), find_lock(directory), directory / LOCK
-    if not take_over:
-        _refuse(directory, found)
-    made = not directory.exists()
+def _take(directory: Path) -> FileIO:
+    """Return the file LOCK, locked, with the line of this job."""
     directory.mkdir(parents=True, exist_ok=True)
-    if found is None:
-        with contextlib.suppress(FileExistsError):  # another job was quicker
-            _write(path, holder)
-    else:
-        # Of several jobs that replace a stale lock at the same time, the last one holds the directory.
-        own = directory / f"{LOCK}.{holder.job}"
-        _write(own, holder)
-        try:
-            os.replace(own, path)
-        finally:
-            own.unlink(missing_ok=True)
-        time.sleep(SETTLE_SECONDS)
-    if not _is_held_by(path, holder):
-        _refuse(directory, find_lock(directory))
-        raise RunInUse(f"{directory}: another job has just used this directory; run the command again")
-    if found is not None:
-        log.warning("%s: this job takes over from a job that %s (%s)", directory,
-                    "has ended" if found.holder.lives() is False else
-                    "has given no sign of life" if found.stale else "may still work there", found.holder)
-    return RunLock(directory, holder, made)
+    path = directory / LOCK
+    with contextlib.ExitStack() as unless_taken:
+        file = unless_taken.enter_context(open(path, "a+b", buffering=0))
+        granted, line = _lock(file, fcntl.LOCK_EX), _read(file)
+        if granted is False:
+            raise RunInUse(f"{directory}: another job works here ({line or 'it has just begun'}); wait until it ends, "
+                           "make a file STOP in the directory to stop it, or choose another --output; if you started "
+                           "one job only, MPI does not connect its ranks: use its mpirun, or `srun --mpi=pmix`")
+        if not _has_name(file, path):  # the job that held it has just removed it
+            return _take(directory)
+        if line and not _has_ended(line, granted):  # it may also have locked directories of variants
+            left = [str(each) for each in sorted(directory.rglob(LOCK)) if each.read_bytes() == path.read_bytes()]
+            raise RunInUse(f"{directory}: a job still works here, or was killed ({line}); if it no longer runs, run "
+                           f"`rm {shlex.join(left)}`")
+        file.truncate(0)
+        file.write(_this_job().encode())
+        unless_taken.pop_all()
+    if granted is None:
+        log.warning("%s: this file system has no locks (flock), so do not start two jobs here at once", directory)
+    return file
 
 
-def _write(path: Path, holder: Holder) -> None:
-    """Write a new lock; FileExistsError if the file exists."""
-    content = f"{json.dumps(asdict(holder))}\n".encode()
-    with open(path, "xb", buffering=0) as file:
-        try:
-            file.write(content)
-        except OSError as error:
-            path.unlink()
-            raise write_error(path, error, len(content)) from None
-
-
-def _now(directory: Path) -> float:
-    """Return the present time by the clock of the directory's file system. If no file can be written there, the clock
-    of this machine is used."""
+def _lock(file: FileIO, kind: int) -> bool | None:
+    """Lock an open file, if no other process holds it. Return whether the lock was granted; None if the file system has
+    no locks."""
     try:
-        with tempfile.TemporaryFile(dir=directory) as file:
-            return os.fstat(file.fileno()).st_mtime
-    except OSError:
-        return time.time()
-
-
-def _is_held_by(path: Path, holder: Holder) -> bool:
-    return path.exists() and _read(path).job == holder.job
-
-
-def _read(path: Path) -> Holder:
-    """Return the job that a lock names. The job's name is UNREADABLE if the lock is incomplete or cannot be read."""
-    try:
-        return Holder(**json.loads(path.read_text()))
-    except (FileNotFoundError, NotADirectoryError):
+        fcntl.flock(file, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        if error.errno in UNSUPPORTED:
+            return None
         raise
-    except (OSError, ValueError, TypeError):
-        return Holder(UNREADABLE, "an unknown machine", "", 0, "", "", 0, "an unknown time")
+    return True
 
 
-def _machine() -> str:
-    """Return the boot id of this machine and the process namespace, which differs between containers; empty if they are
-    unknown."""
+def _this_job() -> str:
+    batch, restarts = os.environ.get("SLURM_JOB_ID"), os.environ.get("SLURM_RESTART_COUNT", "0")
+    return f"{socket.gethostname()}, process {os.getpid()}" + (
+        f", Slurm job {batch}, restart {restarts}" if batch else "")
+
+
+def _has_ended(line: str, granted: bool | None) -> bool:
+    """Return whether the job of a line has ended for certain. It has if it ran on this host, which has `granted` its
+    lock, or if it is an earlier run of this Slurm job, which was queued again."""
+    host, *job = line.split(", ")
+    own_host, *own_job = _this_job().split(", ")
+    queued_again = job[1:2] == own_job[1:2] != [] and job[2:] != own_job[2:]
+    return granted is True and host == own_host or queued_again
+
+
+def _read(file: FileIO) -> str:
+    file.seek(0)
+    return " ".join(file.read().decode(errors="replace").split())
+
+
+def _has_name(file: FileIO, path: Path) -> bool:
+    """Return whether an open file still has this name."""
     try:
-        return Path("/proc/sys/kernel/random/boot_id").read_text().strip() + " " + os.readlink("/proc/self/ns/pid")
-    except OSError:
-        return ""
-
-
-def _born(pid: int) -> str:
-    """Return the start time of a process of this machine; empty if the process has ended or the time is unknown."""
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return ""
-    return "" if state[0] in "ZX" else state[19]  # a zombie has ended
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
+        return False

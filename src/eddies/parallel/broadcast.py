@@ -1,5 +1,6 @@
 """Text that one rank sends to all ranks, and actions whose errors are raised on all ranks."""
 
+import time
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -9,6 +10,7 @@ from eddies.errors import UserError
 from eddies.parallel.reduction import global_min
 
 Result = TypeVar("Result")
+PATIENCE = 5.0  # seconds that a rank waits for the others to meet the same error
 
 
 def first_complaint(comm: MPI.Comm, complaint: str | None) -> str | None:
@@ -69,6 +71,16 @@ def on_all_ranks(comm: MPI.Comm, action: Callable[[], Result], kind: type[Except
     if complaint is not None:
         raise kind(complaint)
     return result
+
+
+def all_arrive(comm: MPI.Comm) -> bool:
+    """Return whether all ranks call this within PATIENCE seconds; `comm` must serve no other purpose."""
+    request, deadline = comm.Ibarrier(), time.monotonic() + PATIENCE
+    while not request.Test():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.01)
+    return True
 
 
 def _arguments(error: Exception | None) -> tuple:

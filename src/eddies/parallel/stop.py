@@ -1,29 +1,22 @@
 """Orderly stop of all ranks at the same step, by a signal, a file STOP or a limit of wall time."""
 
-import contextlib
 import math
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 from mpi4py import MPI
 
-from eddies.errors import UserError
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.reduction import global_max
 
 LOOK_SECONDS = 1.0  # between two checks for the file: on a network file system a check may take longer than a step
 
-# Votes of the ranks; the largest counts. The vote of a signal is _SIGNALS plus its number; _LOST means that the job
-# has lost its run directory.
+# Votes of the ranks; the largest counts. The vote of a signal is _SIGNALS plus its number.
 _NOTHING, _CHECKPOINT, _TIME, _FILE, _SIGNALS = range(5)
-_LOST = 1000
-
-# Returns the error to raise if the job has lost the lock of its run directory, else None.
-LockLoss = Callable[[], UserError | None]
 
 
 class Stopped(Exception):
@@ -52,23 +45,11 @@ class StopRequest:
         self._end, self._interval = now + max_seconds, checkpoint_seconds
         self._checkpoint_at, self._next_look = now + checkpoint_seconds, now
         self._answer = _NOTHING
-        self._lock_losses: list[LockLoss] = []
-
-    @contextlib.contextmanager
-    def watching(self, lock_lost: LockLoss) -> Iterator[None]:
-        """Within this context, calls of this object raise on all ranks the error that `lock_lost` returns on rank 0."""
-        self._lock_losses.append(lock_lost)
-        try:
-            yield
-        finally:
-            self._lock_losses.remove(lock_lost)
 
     def __call__(self) -> bool:
-        """Return, on all ranks, whether any rank has a reason to stop; collective. Raises the error of a lost lock."""
+        """Return, on all ranks, whether any rank has a reason to stop; collective."""
         if self._answer <= _CHECKPOINT:
             self._answer = int(global_max(self.comm, self._own_answer()))
-            if self._answer == _LOST:
-                on_first_rank(self.comm, self._raise_lock_loss)
             if self._answer > _CHECKPOINT and self.stop_file is not None:
                 on_first_rank(self.comm, partial(self.stop_file.unlink, missing_ok=True))
         return self._answer > _CHECKPOINT
@@ -94,12 +75,7 @@ class StopRequest:
         """Start the interval to the next checkpoint."""
         self._checkpoint_at = time.monotonic() + self._interval
 
-    def _raise_lock_loss(self) -> None:
-        raise next(filter(None, (lock_lost() for lock_lost in self._lock_losses)))
-
     def _own_answer(self) -> int:
-        if any(lock_lost() for lock_lost in self._lock_losses):
-            return _LOST
         if self.signals:
             return _SIGNALS + self.signals[0]
         if self.comm.rank > 0:

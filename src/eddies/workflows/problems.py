@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,6 @@ from eddies.errors import UserError
 from eddies.import_path import is_path
 from eddies.flow.stability import REMEDIES, limits_of_step
 from eddies.io.hdf5 import open_product
-from eddies.io.new_files import LARGEST_BYTES, REMEDY, has_single_writer
 from eddies.io.provenance import product_provenance
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_first_rank
@@ -136,8 +135,6 @@ def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]
             check_frames, stages, tracers, scene.own_training, scene.simulation, scene.seen_in(directory)))
     limits = most_ranks(scene.ground_truth_alone if set(stages) == {"dns"} else scene)
     yield from rank_problems(limits, comm.size)
-    if has_single_writer(comm):
-        yield from _large_files({stage: storage(scene, stage, comm.size) for stage in stages}, comm.size)
     if "train" in stages and scene.model.path is None and scene.training.truths is not None:
         from eddies.workflows.learned.truths import truth_problems  # imports torch
         yield from truth_problems(scene.training, tracers, scene.model.reads, truth, comm)
@@ -193,14 +190,6 @@ def _too_few_frames(tracers: Tracers, turnover_time: float, check: Callable[[int
             check(frames)
         except SceneError as error:
             yield f"[tracers] turnovers = {tracers.turnovers:g} is expected to give at most {frames} frames: {error}"
-
-
-def _large_files(needs: Mapping[str, Storage], ranks: int) -> Iterator[str]:
-    """Yield a problem for each product that is too large if rank 0 writes it for all ranks."""
-    for stage, needed in needs.items():
-        if (size := (needed.kept or 0.0) - needed.other_files) > LARGEST_BYTES:
-            yield (f"{STAGES[stage].file}: this h5py has no MPI, so rank 0 writes the file for all {ranks} ranks, and "
-                   f"it can have at most {in_units(LARGEST_BYTES)}; it will take {in_units(size)}; {REMEDY}")
 
 
 def directory_problems(stages: Sequence[str], comm: Comm, directory: Path) -> list[str]:

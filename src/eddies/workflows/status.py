@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from eddies.io.checksums import ATTRIBUTE, find_damage, open_to_read
 from eddies.io.errors import ProductError, remedy_for
 from eddies.io.hdf5 import in_files
 from eddies.io.provenance import product_fingerprint, product_provenance
-from eddies.io.run_lock import find_lock
+from eddies.io.run_lock import job_in
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES, Stage
@@ -74,8 +73,7 @@ def before_checksums(path: Path) -> bool:
 
 def _print(comm: Comm, line: str) -> None:
     if comm.rank == 0:
-        sys.stdout.write(f"{line}\n")
-        sys.stdout.flush()
+        print(line, flush=True)
 
 
 def status_lines(directory: Path) -> Iterator[str]:
@@ -94,8 +92,8 @@ def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
     """Yield a line with the path, the size and the job of a run, then a line for each stage. The directories of its
     variants are added to `inner`."""
     files = [path for path in directory.rglob("*") if path.is_file() and not path.is_symlink()]
-    size, held = in_units(sum(path.stat().st_size for path in files)), find_lock(directory)
-    job = "" if held is None else f", {held.holder}{', without a sign of life' if held.stale else ''}"
+    size, held = in_units(sum(path.stat().st_size for path in files)), job_in(directory)
+    job = held and f", {held}"
     try:
         scene = load_scene(directory / SCENE)
     except SceneError as error:

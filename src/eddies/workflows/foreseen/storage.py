@@ -34,14 +34,12 @@ class Storage(NamedTuple):
     """Bytes that a stage needs: memory of the rank that needs the most, and disk space of the stage.
 
     `kept` is the disk space of the files that the stage leaves in the run directory, None if unknown. `scratch` is that
-    of the files that it removes at its end. `other_files` is the part of `kept` that is not in the product of the
-    stage.
+    of the files that it removes at its end.
     """
 
     memory: float
     kept: float | None
     scratch: float = 0.0
-    other_files: float = 0.0
 
 
 def storage(scene: Scene, stage: str, ranks: int) -> Storage:
@@ -110,14 +108,14 @@ def evaluation_memory(tracers: Tracers, ranks: int, neighbors: float, skin: floa
 
 
 def flow_disk(flow: Flow, tracers: Tracers | None, simulation: Simulation | None, training: Training | None,
-              expected: Estimates) -> tuple[float | None, float, float]:
-    """Return `kept`, `scratch` and `other_files` of the direct simulation (see `Storage`)."""
+              expected: Estimates) -> tuple[float | None, float]:
+    """Return `kept` and `scratch` of the direct simulation (see `Storage`)."""
     k_max, intervals = flow.largest_wavenumber, expected.frame_intervals
     statistics = (SAMPLE_BYTES + 8 * (math.ceil(math.sqrt(3) * k_max) + 1)) * ((expected.steps or 0) // EVERY)
     state = flow.components * (2 * k_max + 1) ** 2 * (k_max + 1) * 2 * flow.real_bytes
     checkpoints = KEPT * state    # KEPT + 1 exist while one is written; one stays, as `state`
     if tracers is None:
-        return state + statistics + 4 * flow.components * flow.cells**3, checkpoints, state
+        return state + statistics + 4 * flow.components * flow.cells**3, checkpoints
     during, after = (
         trajectory_bytes(flow, tracers, frames,
                          len(unfiltered_frames(simulation, training, tracers.field_every, frames)))
@@ -125,7 +123,7 @@ def flow_disk(flow: Flow, tracers: Tracers | None, simulation: Simulation | None
     if tracers.sets:  # each set has the statistics; the run directory has the final fields and no last state
         after += len(tracers.sets) * statistics + 4 * flow.components * flow.cells**3
         state = 0
-    return None if intervals is None else state + statistics + after, checkpoints + during, state
+    return None if intervals is None else state + statistics + after, checkpoints + during
 
 
 def most_disk(work: Iterable[Storage]) -> float:
