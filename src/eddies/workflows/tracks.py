@@ -18,6 +18,7 @@ from eddies.analysis.isotropic_turbulence import dissipation_constant
 from eddies.flow.statistics import component_energies, energy_spectrum, gradient_moments, turbulence_scales
 from eddies.io.fields import FieldWriter
 from eddies.io.hdf5 import create_product, in_files, write_table
+from eddies.io.new_files import set_attributes
 from eddies.io.trajectories import TrajectoryWriter
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import IdOrder, id_block, migrate
@@ -197,12 +198,12 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             spectra.append((time, flow.energy, flow.filtered_energy))
         if traced:
             reference |= measured_scales(comm, *paths, times[1])
-        file.create_group("reference").attrs.update({
+        set_attributes(file.create_group("reference"), {
             **reference, "released_at": 0.0, "energy": float(spectra[0][1].sum()), **sound})
         write_table(file, "statistics", {name: np.array([row[name] for row in rows]) for name in rows[0]})
         table = dict(zip(("time", "energy", "filtered"), map(np.array, zip(*spectra))))
         write_table(file, "spectra", {"wavenumber": np.arange(table["energy"].shape[1]), **table})
-        file.create_group("tracks").attrs.update({
+        set_attributes(file.create_group("tracks"), {
             **tracks.about, "complete": complete, "mean_count": tracks.mean_count, "weight": weight,
             **({} if math.isnan(error) else {"validation_error": error}), "traced": follows})
     log.info("dns: %d tracks, on average %.0f in a frame; %d are in each of the %d frames; duration %.3g T, u' = %.3g, "
