@@ -13,6 +13,7 @@ import re
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -28,7 +29,7 @@ from eddies.io.errors import ContentError, ProductError, WriteError, read_errors
 from eddies.io.frame_segments import FrameSegments
 from eddies.io.hdf5 import empty_dataset, in_files, write_block
 from eddies.io.new_files import new_file, writing
-from eddies.io.provenance import product_provenance
+from eddies.io.provenance import read_json
 from eddies.kernels.library import in_use
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.stop import Stopped, StopRequest
@@ -224,7 +225,9 @@ def _newest_first(directory: Path) -> list[Path]:
 
 def _identity(path: Path) -> str:
     """Return the id and the size of a product, as text. A product that replaces another may have the same id."""
-    return f"{product_provenance(path).get('id')}, {path.stat().st_size if path.is_file() else 0} bytes"
+    with suppress(ContentError), open_to_read(path) as file:
+        return f"{read_json(file, 'provenance').get('id')}, {path.stat().st_size} bytes"
+    return "missing or damaged"
 
 
 def _step_of(path: Path) -> int:

@@ -2,7 +2,8 @@
 
 All data that this package writes have a checksum in each chunk (`fletcher32`). Files have the layout of HDF5 1.10, in
 which HDF5's own structure has checksums, too. Texts of attributes have a fixed length, because HDF5 stores those of
-variable length without a checksum.
+variable length without a checksum. The few texts of H5MD, which only other programs read, have a variable length, as
+these programs expect.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from mpi4py import MPI
 
 from eddies.io.damage import naming_damage, open_to_read
 from eddies.io.errors import ProductError, file_errors, read_errors, remedy_for
-from eddies.io.new_files import HEADER_BYTES, frame_bytes, new_file, set_attributes, writing
+from eddies.io.new_files import HEADER_BYTES, frame_bytes, new_file, set_attributes, writes_first, writing
 from eddies.io.provenance import FORMAT, environment, has_this_format, product_ids, read_json, read_provenance
 from eddies.io.quantities import conventions, describe, python_value
 from eddies.parallel.broadcast import on_all_ranks, on_first_rank
@@ -93,9 +93,11 @@ def write_table(file: h5py.Group, name: str, columns: Mapping[str, Any]) -> None
 def write_array(group: h5py.Group, name: str, values: np.ndarray) -> None:
     """Write an array, equal on all ranks, as a dataset; collective."""
     dataset = empty_dataset(group, name, values.shape, values.dtype)
-    if values.size:
-        with writing(group, values.nbytes):
-            dataset[...] = values
+    if values.ndim == 0:
+        dataset[()] = values
+    elif values.size:
+        with writing(group, 0):  # data with checksums are written collectively; rank 0 writes all of them
+            write_block(dataset, values if writes_first(group) else values[:0], (0,) * values.ndim)
 
 
 def read_table(file: h5py.Group, name: str) -> dict[str, np.ndarray]:

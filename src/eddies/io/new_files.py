@@ -137,6 +137,11 @@ def writing(group: h5py.Group | h5py.Dataset, size: int) -> Iterator[None]:
                            "check the disk, then run the command again") from None
 
 
+def writes_first(group: h5py.Group | h5py.Dataset) -> bool:
+    """Return whether this rank is the first of those that write the file."""
+    return _open[group.file.filename].comm.rank == 0
+
+
 def writing_failed() -> bool:
     """Return whether HDF5 failed to write a file. The process then crashes at its end unless it is aborted."""
     return any(new.broken for new in _abandoned)
@@ -151,8 +156,8 @@ def require_parallel_hdf5(comm: MPI.Comm) -> None:
 
 
 def set_attributes(item: h5py.Group | h5py.Dataset, values: Mapping[str, Any]) -> None:
-    """Set attributes of a group or dataset; collective. Texts are stored with a fixed length, in UTF-8, so that HDF5
-    covers them by a checksum."""
+    """Set attributes of a group or dataset; collective. Texts are stored with a fixed length, in UTF-8, because HDF5
+    has no checksum of texts of variable length."""
     for name, value in values.items():
         if isinstance(value, str):
             text = value.encode()

@@ -15,7 +15,7 @@ from mpi4py import MPI
 
 import eddies
 from eddies.io.damage import open_to_read
-from eddies.io.errors import ProductError
+from eddies.io.errors import ContentError, ProductError
 from eddies.io.quantities import python_value
 from eddies.kernels.library import in_use
 from eddies.pipeline import MAKER_OF
@@ -131,8 +131,8 @@ def _read_sound(path: str | Path, read: Callable[[h5py.File], dict[str, Any]]) -
         return {}
 
 
-def _damaged(file: h5py.File, name: str) -> ProductError:
-    return ProductError(f"{file.filename}: its attribute {name} is missing or not valid, the file is damaged; make it "
+def _damaged(file: h5py.File, name: str) -> ContentError:
+    return ContentError(f"{file.filename}: its attribute {name} is missing or not valid, the file is damaged; make it "
                         "again")
 
 

@@ -13,7 +13,6 @@ import numpy as np
 
 import eddies
 from eddies.io.hdf5 import append_frame, find_group, growing_dataset, read_frame, read_times, unfit, write_array
-from eddies.io.new_files import set_attributes
 
 IMAGE = "image"
 UNITS = {"position": "Angstrom", "velocity": "Angstrom ps-1"}
@@ -41,13 +40,13 @@ class TrajectoryWriter:
         write_h5md_header(file)
         self._group = file.create_group(f"particles/{name}")
         box = self._group.create_group("box")
-        set_attributes(box, {"edge": length, "dimension": 3, "boundary": np.array([b"periodic"] * 3)})
+        box.attrs.update({"edge": length, "dimension": 3, "boundary": np.array([b"periodic"] * 3)})
         write_array(self._group, "id", np.arange(total))
         self._step = growing_dataset(self._group, "step", (), np.int64)
         self._time = growing_dataset(self._group, "time", (), np.float64)
-        set_attributes(self._time, {"unit": "ps"})
+        self._time.attrs["unit"] = "ps"
         self._edges = self._element("box/edges", (3, 3), np.float64)
-        set_attributes(self._edges, {"unit": UNITS["position"]})
+        self._edges.attrs["unit"] = UNITS["position"]
         self._columns = {column: self._element(column, (total, *shape), dtype)
                          for column, shape in columns.items()}
         self._length, self._images = length, images
@@ -72,7 +71,7 @@ class TrajectoryWriter:
         element["step"], element["time"] = self._step, self._time
         values = growing_dataset(element, "value", frame_shape, dtype)
         if column in UNITS:
-            set_attributes(values, {"unit": UNITS[column]})
+            values.attrs["unit"] = UNITS[column]
         return values
 
     def _count_images(self, position: np.ndarray) -> np.ndarray:
@@ -133,5 +132,5 @@ def write_h5md_header(file: h5py.File) -> None:
         return
     header = file.create_group("h5md")
     header.attrs["version"] = np.array([1, 1])
-    set_attributes(header.create_group("author"), {"name": "unknown"})
-    set_attributes(header.create_group("creator"), {"name": "eddies", "version": eddies.__version__})
+    header.create_group("author").attrs["name"] = "unknown"
+    header.create_group("creator").attrs.update({"name": "eddies", "version": eddies.__version__})
