@@ -79,8 +79,8 @@ def _first_damage(path: Path, rank: int, ranks: int) -> str | None:
                 item = file[name]
                 dict(item.attrs)
                 if isinstance(item, h5py.Dataset):
-                    for number, part in enumerate(item.iter_chunks() if item.chunks else [()]):
-                        place = f"{name}, frame {part[0].start}" if item.chunks else name
+                    for number, part in enumerate(item.iter_chunks() if item.chunks and item.size else [()]):
+                        place = f"{name}, frame {part[0].start}" if part else name
                         if number % ranks == rank:
                             item[part]
     except ContentError:

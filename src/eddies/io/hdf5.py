@@ -97,7 +97,8 @@ def write_array(group: h5py.Group, name: str, values: np.ndarray) -> None:
         dataset[()] = values
     elif values.size:
         with writing(group, 0):  # data with checksums are written collectively; rank 0 writes all of them
-            write_block(dataset, values if writes_first(group) else values[:0], (0,) * values.ndim)
+            own = np.ascontiguousarray(values if writes_first(group) else values[:0])
+            write_block(dataset, own, (0,) * values.ndim)
 
 
 def read_table(file: h5py.Group, name: str) -> dict[str, np.ndarray]:
