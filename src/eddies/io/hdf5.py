@@ -245,7 +245,8 @@ def _problem(file: h5py.File, kind: str | None, remedy: str) -> str | None:
     """Return why an open file is not a complete product of this `kind`, with a remedy; None if it is one. `remedy` is
     the remedy for a file of another kind and for an unfinished file."""
     try:
-        stored, complete = python_value(file.attrs.get("kind", "unknown")), bool(file.attrs.get("complete", False))
+        stored = str(python_value(file.attrs.get("kind", "unknown")))
+        complete = bool(file.attrs.get("complete", False))
     except (OSError, TypeError, ValueError) as error:
         return f"damaged, its attributes cannot be read ({error}); make it again, or give another file"
     if kind not in (None, stored):
