@@ -6,7 +6,7 @@ import pytest
 
 import eddies
 from eddies.io import datasets
-from eddies.io.checksums import open_to_read
+from eddies.io.damage import open_to_read
 from eddies.io.fields import FieldWriter
 from eddies.io.hdf5 import create_product
 from tests.left_out import leave_out_figures

@@ -83,7 +83,7 @@ def build_parser() -> argparse.ArgumentParser:
     status = add_command(commands, "status", "the state of run directories: stages, checkpoints, jobs, sizes")
     status.add_argument("directory", nargs="?", type=directory, default=Path("runs"), metavar="DIR",
                         help="a run directory, or a directory that holds several (default: runs)")
-    status.add_argument("--verify", action="store_true", help="compare all bytes of the products with their checksums")
+    status.add_argument("--verify", action="store_true", help="read all of the products, which finds damage")
     diff = add_command(commands, "diff", "the differences between two runs: settings and numbers")
     add_run(diff, "one")
     add_run(diff, "other", nargs="?")

@@ -48,7 +48,7 @@ class StoredRun:
     @property
     def groups(self) -> list[str]:
         """Names for `run[...]`, such as "rollout/particles/model"."""
-        from eddies.io.checksums import open_to_read
+        from eddies.io.damage import open_to_read
         from eddies.io.datasets import groups_in
         found = []
         for product in self.products:

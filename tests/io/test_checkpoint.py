@@ -11,13 +11,14 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import h5py
 import numpy as np
 import pytest
 
-from eddies.io import checksums
+from eddies.io import damage
 from eddies.io.checkpoint import Block, CheckpointDirectory, Guard, checkpoints_in
-from eddies.io.checksums import add_checksums
 from eddies.io.errors import ProductError, WriteError
+from eddies.io.hdf5 import create_product, write_table
 from eddies.parallel.slab import block_starts
 from eddies.parallel.stop import Stopped, StopRequest
 from tests.full_disk import largest_file
@@ -125,14 +126,11 @@ def test_which_checkpoints_are_used(comm, tmp_path, caplog, monkeypatch):
 def test_what_the_system_refuses_to_read_is_kept(comm, tmp_path, monkeypatch, name, rank):
     """It may be sound. All ranks raise, also if only the last one cannot read the file."""
     directory = fill(comm, tmp_path, [1])
-    frames = directory.path / "frames-00000000.h5"
-    if comm.rank == 0:
-        frames.write_bytes(b"frames" * 1000)
-    add_checksums(comm, frames)
+    frames = write_frames(comm, directory.path)
     directory.write(2, arrays(comm, 2)[0], [frames.name])
     before = sorted(directory.path.iterdir())
     comm.Barrier()
-    opened = checksums._opened
+    opened = damage._opened
 
     def refuse(path):
         if comm.rank == rank % comm.size and Path(path).name == name:
@@ -140,7 +138,7 @@ def test_what_the_system_refuses_to_read_is_kept(comm, tmp_path, monkeypatch, na
         return opened(path)
 
     with monkeypatch.context() as patch:
-        patch.setattr(checksums, "_opened", refuse)
+        patch.setattr(damage, "_opened", refuse)
         with pytest.raises(ProductError, match=f"{name}: cannot be read: Too many open files; check"):
             directory.newest()
         if comm.rank == 0 == rank and name.startswith("step"):
@@ -150,11 +148,21 @@ def test_what_the_system_refuses_to_read_is_kept(comm, tmp_path, monkeypatch, na
     assert sorted(directory.path.iterdir()) == before and directory.newest().content["step"] == 2
 
 
+def write_frames(comm, directory):
+    """A file that may belong to a checkpoint."""
+    with create_product(comm, directory / "frames-00000000.h5", "frames", {}) as file:
+        write_table(file, "table", {"values": np.arange(5000.0)})
+    return directory / "frames-00000000.h5"
+
+
 def harm(path, kind, chooser):
-    """Flip a random bit of a file, or cut it off."""
-    content = bytearray(path.read_bytes())
+    """Flip a random bit of the values in a file, or cut it off."""
+    content, name = bytearray(path.read_bytes()), "modes" if path.name.startswith("step") else "table/values"
     at = chooser.randrange(len(content))
     if kind == "flip":
+        with h5py.File(path, locking=False) as file:
+            chunk = file[name].id.get_chunk_info(0)
+        at = chunk.byte_offset + at % chunk.size
         content[at] ^= 1 << chooser.randrange(8)
     else:
         del content[at:]
@@ -166,11 +174,9 @@ def harm(path, kind, chooser):
 def test_damage_is_found_and_the_checkpoint_before_is_used(comm, tmp_path, caplog):
     """Also damage of the frames that belong to it, and sound frames of another run."""
     path, chooser = tmp_path / "checkpoints", random.Random(comm.size)
-    frames = path / "frames-00000000.h5"
     if comm.rank == 0:
         path.mkdir()
-        frames.write_bytes(b"frames" * 1000)
-    add_checksums(comm, frames)
+    frames = write_frames(comm, path)
     fill(comm, tmp_path, [1])
     CheckpointDirectory(comm, path, "settings").write(2, arrays(comm, 2)[0], [frames.name])
     assert CheckpointDirectory(comm, path, "settings").newest().files == [frames.name]
@@ -182,13 +188,11 @@ def test_damage_is_found_and_the_checkpoint_before_is_used(comm, tmp_path, caplo
         harmed = f"{kind} {name}"
         if comm.rank == 0:
             shutil.copytree(path, directory.path)
-            if kind == "others":
-                (directory.path / name).write_bytes(b"others" * 1000)
-            else:
+            if kind != "others":
                 harmed = harm(directory.path / name, kind, chooser)
-        if kind == "others":
-            add_checksums(comm, directory.path / name)
         comm.Barrier()
+        if kind == "others":
+            write_frames(comm, directory.path)
         assert directory.newest().content["step"] == 1, harmed
         assert comm.rank > 0 or re.search(f"{name}: .*not used", caplog.text), harmed
 

@@ -3,6 +3,8 @@
 import h5py
 import numpy as np
 
+from eddies.io.quantities import python_value
+
 
 def numbers_in(comm, path):
     """All datasets and attributes below the root of a product, by path, except wall times."""
@@ -18,7 +20,7 @@ def below(item, name):
     if isinstance(item, h5py.Dataset):
         yield name, item[()]
         return
-    yield from ((f"{name}/{key}", value) for key, value in item.attrs.items())
+    yield from ((f"{name}/{key}", python_value(value)) for key, value in item.attrs.items())
     for key, part in item.items():
         yield from below(part, f"{name}/{key}")
 

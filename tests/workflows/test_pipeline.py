@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from eddies.io.quantities import python_value
 from eddies.io.weights import load_weights
 from eddies.learning.optimization import shared_values
 from eddies.scene.model import BUILT_IN_PREFIX, WEIGHTS, built_in_weights
@@ -77,7 +78,8 @@ def test_every_dataset_says_its_units_axes_and_what_it_is(run_directory):
 
 def check_words(path, dataset):
     """A dataset has its attributes, with a name for each axis; a time has an origin."""
-    units, axes, description = (dataset.attrs[name] for name in ("units", "axes", "description"))
+    units, axes, description = (python_value(dataset.attrs[name])
+                                for name in ("units", "axes", "description"))
     where = f"{dataset.file.filename}, {path}"
     assert path.startswith("weights/") or len(axes.split()) == dataset.ndim, where
     assert not path.endswith("/time") or (units == "T" and description.startswith("since the")), where
@@ -190,7 +192,7 @@ def test_a_trained_model_runs_on_another_flow(comm, run_directory, tmp_path):
         assert adopted["a_priori/delay"][0] > 0
     with h5py.File(tmp_path / "run" / "rollout.h5") as file:
         rollout = dict(file["rollout"].attrs)
-        assert rollout["start_time"] == pytest.approx(0.1) and rollout["status"] == "complete"
+        assert rollout["start_time"] == pytest.approx(0.1) and python_value(rollout["status"]) == "complete"
     metrics = json.loads((tmp_path / "run" / "report" / "metrics.json").read_text())
     shown = metrics["model"]
     assert metrics["warnings"] == []

@@ -1,19 +1,19 @@
 """Checkpoints: files step-NNNNNNNN.h5 with global arrays, which do not depend on the number of ranks.
 
 io/new_files.py describes how they are written. Everything that is not an array is stored together, as one dataset of
-JSON. Checksums (io/checksums.py) cover every byte, and a damaged checkpoint is not used. Other files of the directory
-may belong to a checkpoint, which then stores their checksums.
+JSON. A damaged checkpoint (io/damage.py) is not used. Other files of the directory may belong to a checkpoint, which
+then stores their ids.
 """
 
 from __future__ import annotations
 
 import json
 import logging
-import math
 import re
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -24,11 +24,12 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.cores import threads
-from eddies.io.checksums import find_damage, open_to_read, table_checksum
+from eddies.io.damage import find_damage, naming_damage, open_to_read
 from eddies.io.errors import ContentError, ProductError, WriteError, read_errors
 from eddies.io.frame_segments import FrameSegments
-from eddies.io.hdf5 import in_files, write_block
-from eddies.io.new_files import HEADER_BYTES, new_file, writing
+from eddies.io.hdf5 import empty_dataset, in_files, write_block
+from eddies.io.new_files import new_file, writing
+from eddies.io.provenance import read_json
 from eddies.kernels.library import in_use
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.stop import Stopped, StopRequest
@@ -40,7 +41,7 @@ NAME = re.compile(r"step-(\d{8,})(\.h5)?")
 PLAIN = "plain"  # the dataset of everything that is not an array, as JSON
 # Checkpoints of another format are not used. Raise this number also when FORMAT of io/provenance.py is raised, because
 # the files with the frames of a checkpoint have that format.
-FORMAT = 12
+FORMAT = 13
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class Checkpoint(Mapping):
     @cached_property
     def content(self) -> dict[str, Any]:
         """All that is not an array: a dict of `step`, `format`, `fingerprint`, `computed_by`, `values` and `files`.
-        `values` maps the names of values to the values; `files` maps file names to checksums."""
+        `values` maps the names of values to the values; `files` maps file names to ids."""
         return json.loads(self.read(PLAIN).tobytes())
 
     @property
@@ -85,7 +86,7 @@ class Checkpoint(Mapping):
 
     def read(self, name: str, start: int = 0, stop: int | None = None, axis: int = 0) -> np.ndarray:
         """Return rows start, ..., stop - 1 of an array along an axis. Not collective: each rank reads what it needs."""
-        with open_to_read(self.path) as file:
+        with open_to_read(self.path) as file, naming_damage(self.path):
             return file[name][(slice(None),) * axis + (slice(start, stop),)]
 
 
@@ -112,7 +113,7 @@ class CheckpointDirectory:
             self.path.mkdir(parents=True, exist_ok=True)
             return json.dumps({"step": step, "format": FORMAT, "fingerprint": self.fingerprint,
                                "computed_by": _computed_by(), "values": values,
-                               "files": {name: table_checksum(self.path / name) for name in files}})
+                               "files": {name: _identity(self.path / name) for name in files}})
 
         if on_first_rank(self.comm, path.exists) and self._complaint(path) is None:
             return
@@ -166,8 +167,11 @@ class CheckpointDirectory:
             return f"{path}: was made by another version of eddies"
         if content["fingerprint"] != self.fingerprint:
             return f"{path}: was made with other settings"
-        files = {path: None} | {self.path / name: known for name, known in content["files"].items()}
-        return next(filter(None, (find_damage(self.comm, file, known) for file, known in files.items())), None)
+        for name, known in content["files"].items():
+            if on_first_rank(self.comm, lambda name=name: _identity(self.path / name)) != known:
+                return f"{self.path / name}: is missing, or is not the file that was written"
+        files = [path, *(self.path / name for name in content["files"])]
+        return next(filter(None, (find_damage(self.comm, file) for file in files)), None)
 
 
 class Guard:
@@ -219,6 +223,13 @@ def _newest_first(directory: Path) -> list[Path]:
                   key=_step_of, reverse=True)
 
 
+def _identity(path: Path) -> str:
+    """Return the id and the size of a product, as text. A product that replaces another may have the same id."""
+    with suppress(ContentError), open_to_read(path) as file:
+        return f"{read_json(file, 'provenance').get('id')}, {path.stat().st_size} bytes"
+    return "missing or damaged"
+
+
 def _step_of(path: Path) -> int:
     return int(NAME.fullmatch(path.name)[1])
 
@@ -249,8 +260,7 @@ def _write_array(file: h5py.File, name: str, block: Block) -> None:
     """
     values, axis = block.values, block.axis
     shape = (*values.shape[:axis], block.total, *values.shape[axis + 1:])
-    with writing(file, math.prod(shape) * values.dtype.itemsize + HEADER_BYTES):
-        dataset = file.create_dataset(name, shape, values.dtype)
+    dataset = empty_dataset(file, name, shape, values.dtype)
     if 0 in shape:
         return  # HDF5 does not write an empty dataset collectively
     for lead in np.ndindex(shape[:min(axis, 1)]):

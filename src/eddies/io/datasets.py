@@ -13,7 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from eddies.io.checksums import open_to_read
+from eddies.io.damage import open_to_read
 from eddies.io.errors import ProductError
 from eddies.io.quantities import dataset_attributes, python_value
 
@@ -76,7 +76,8 @@ def open_group(path: Path, name: str) -> Any:
         if not isinstance(group, h5py.Group):
             raise ProductError(f"{path}: holds no {name}; it holds: {', '.join(groups_in(file))}")
         columns = {key: item.get("value") if isinstance(item, h5py.Group) else item for key, item in group.items()}
-        arrays = {key: Array(item.shape, item.dtype, dict(item.attrs), partial(read, item.name))
+        arrays = {key: Array(item.shape, item.dtype, {name: python_value(value) for name, value in item.attrs.items()},
+                             partial(read, item.name))
                   for key, item in columns.items() if isinstance(item, h5py.Dataset)}
         attributes = {key: python_value(value) for key, value in group.attrs.items()}
     return as_dataset(arrays, attributes)

@@ -24,7 +24,7 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from eddies.io.checksums import open_to_read
+from eddies.io.damage import open_to_read
 from eddies.io.errors import ContentError, ProductError, read_errors
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import open_product

@@ -15,9 +15,9 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from eddies.io.checksums import ATTRIBUTE, WORDS, open_to_read
+from eddies.io.damage import naming_damage, open_to_read
 from eddies.io.errors import ProductError, file_errors, read_errors, remedy_for
-from eddies.io.new_files import HEADER_BYTES, frame_bytes, new_file, writing
+from eddies.io.new_files import HEADER_BYTES, frame_bytes, new_file, set_attributes, writes_first, writing
 from eddies.io.provenance import FORMAT, environment, has_this_format, product_ids, read_json, read_provenance
 from eddies.io.quantities import conventions, describe, python_value
 from eddies.parallel.broadcast import on_all_ranks, on_first_rank
@@ -59,8 +59,8 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
             **environment(comm.size), "id": uuid.uuid4().hex, **provenance,
             "made_from": product_ids(path.parent, provenance.get("made_from", ()))}))
         with writing(file, len(origin) + HEADER_BYTES):
-            file.attrs.update({"kind": kind, "format": FORMAT, "complete": False, "provenance": origin,
-                               ATTRIBUTE: WORDS, **conventions(kind)})
+            set_attributes(file, {"kind": kind, "format": FORMAT, "complete": False, "provenance": origin,
+                                  **conventions(kind)})
         yield file
         with writing(file, HEADER_BYTES):
             file.attrs["complete"] = True
@@ -73,7 +73,7 @@ def open_product(comm: MPI.Comm, path: str | Path, kind: str | None) -> Iterator
     Raises:
         ProductError: the file is missing, truncated, not an HDF5 file, unfinished, or of another kind or format.
     """
-    with on_all_ranks(comm, lambda: _open_checked(Path(path), kind), ProductError) as file:
+    with on_all_ranks(comm, lambda: _open_checked(Path(path), kind), ProductError) as file, naming_damage(path):
         yield file
 
 
@@ -92,8 +92,13 @@ def write_table(file: h5py.Group, name: str, columns: Mapping[str, Any]) -> None
 
 def write_array(group: h5py.Group, name: str, values: np.ndarray) -> None:
     """Write an array, equal on all ranks, as a dataset; collective."""
-    with writing(group, values.nbytes + HEADER_BYTES):
-        describe(group.create_dataset(name, data=values))
+    dataset = empty_dataset(group, name, values.shape, values.dtype)
+    if values.ndim == 0:
+        dataset[()] = values
+    elif values.size:
+        with writing(group, 0):  # data with checksums are written collectively; rank 0 writes all of them
+            own = np.ascontiguousarray(values if writes_first(group) else values[:0])
+            write_block(dataset, own, (0,) * values.ndim)
 
 
 def read_table(file: h5py.Group, name: str) -> dict[str, np.ndarray]:
@@ -133,17 +138,37 @@ def stored_numbers(file: h5py.File) -> Iterator[tuple[str, int | None, np.ndarra
 def growing_dataset(group: h5py.Group, name: str, frame_shape: tuple[int, ...], dtype: Any) -> h5py.Dataset:
     """Create an empty dataset (frames, *frame_shape) for `append_frame`; collective.
 
-    A chunk has at most about 1 MiB. It holds part of a frame, or many frames if a frame has few values.
+    A chunk holds part of a frame, or many frames if a frame has few values.
     """
     values = math.prod(frame_shape)
-    chunk, largest = [256 // values if 0 < values <= FEW else 1], CHUNK_BYTES // np.dtype(dtype).itemsize
-    for axis, extent in enumerate(frame_shape):
-        chunk.append(max(1, min(extent, largest // max(math.prod(frame_shape[axis + 1:]), 1))))
+    frames = 256 // values if 0 < values <= FEW else 1
     with writing(group, HEADER_BYTES):
-        dataset = group.create_dataset(name, (0, *frame_shape), dtype, maxshape=(None, *frame_shape),
-                                       chunks=tuple(chunk))
+        dataset = group.create_dataset(name, (0, *frame_shape), dtype, maxshape=(None, *frame_shape), fletcher32=True,
+                                       chunks=(frames, *chunk_of(frame_shape, dtype)))
         describe(dataset)
     return dataset
+
+
+def empty_dataset(group: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any) -> h5py.Dataset:
+    """Create a dataset whose values are written later; collective. Its chunks have checksums. A single number is
+    stored in the header of the dataset, which has a checksum."""
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    with writing(group, size + HEADER_BYTES * (1 + size // CHUNK_BYTES // 32)):
+        if shape and size:
+            dataset = group.create_dataset(name, shape, dtype, chunks=chunk_of(shape, dtype), fletcher32=True)
+        else:
+            compact = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+            compact.set_layout(h5py.h5d.COMPACT)
+            dataset = group.create_dataset(name, shape, dtype, dcpl=compact)
+        describe(dataset)
+    return dataset
+
+
+def chunk_of(shape: tuple[int, ...], dtype: Any) -> tuple[int, ...]:
+    """Return the shape of a chunk of at most about 1 MiB."""
+    largest = CHUNK_BYTES // np.dtype(dtype).itemsize
+    return tuple(max(1, min(extent, largest // max(math.prod(shape[axis + 1:]), 1)))
+                 for axis, extent in enumerate(shape))
 
 
 def append_frame(dataset: h5py.Dataset, block: np.ndarray, offset: tuple[int, ...]) -> None:
@@ -175,7 +200,7 @@ def read_frame(dataset: h5py.Dataset, frame: int, selection: tuple[slice, ...], 
     0 to `limit` is an error, too. In a rollout, numbers that are not finite are allowed, because a rollout may end
     with them.
     """
-    values, kind = dataset[frame, *selection], dataset.file.attrs["kind"]
+    values, kind = dataset[frame, *selection], python_value(dataset.file.attrs["kind"])
     place = f"frame {frame % len(dataset)}: holds values that are"
     if kind != "rollout" and not np.isfinite(values).all():
         raise unfit(dataset, f"{place} not finite")
@@ -194,7 +219,8 @@ def read_times(dataset: h5py.Dataset) -> np.ndarray:
 
 def unfit(dataset: h5py.Dataset, problem: str) -> ProductError:
     """Return the error for a dataset with content that no stage writes."""
-    return ProductError(f"{dataset.file.filename}: {dataset.name}, {problem}; {remedy_for(dataset.file.attrs['kind'])}")
+    kind = python_value(dataset.file.attrs["kind"])
+    return ProductError(f"{dataset.file.filename}: {dataset.name}, {problem}; {remedy_for(kind)}")
 
 
 def _open_checked(path: Path, kind: str | None) -> h5py.File:
@@ -219,7 +245,8 @@ def _problem(file: h5py.File, kind: str | None, remedy: str) -> str | None:
     """Return why an open file is not a complete product of this `kind`, with a remedy; None if it is one. `remedy` is
     the remedy for a file of another kind and for an unfinished file."""
     try:
-        stored, complete = str(file.attrs.get("kind", "unknown")), bool(file.attrs.get("complete", False))
+        stored = str(python_value(file.attrs.get("kind", "unknown")))
+        complete = bool(file.attrs.get("complete", False))
     except (OSError, TypeError, ValueError) as error:
         return f"damaged, its attributes cannot be read ({error}); make it again, or give another file"
     if kind not in (None, stored):

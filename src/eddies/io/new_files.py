@@ -34,7 +34,7 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.errors import UserError
-from eddies.io.checksums import add_checksums
+from eddies.io.damage import LAYOUT
 from eddies.io.errors import ProductError, WriteError, file_errors, space_in_words
 from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank
 from eddies.parallel.stop import Stopped
@@ -74,7 +74,7 @@ def write_files(contents: Mapping[Path, bytes | str]) -> None:
 
 
 @contextmanager
-def new_file(comm: MPI.Comm, path: Path, checksums: bool = True) -> Iterator[h5py.File]:
+def new_file(comm: MPI.Comm, path: Path) -> Iterator[h5py.File]:
     """Write an HDF5 file, all ranks together. It appears under `path` after the block has ended without an exception.
 
     Raises WriteError on all ranks if the file cannot be written or renamed.
@@ -85,9 +85,8 @@ def new_file(comm: MPI.Comm, path: Path, checksums: bool = True) -> Iterator[h5p
         with writing(new.file, 0):
             new.close()
         with file_errors(path):
-            if checksums:
-                add_checksums(comm, new.path)
-                on_all_ranks(comm, lambda: _force_to_disk(new.path))  # on every node
+            comm.Barrier()  # all ranks have closed the file
+            on_all_ranks(comm, lambda: _force_to_disk(new.path))  # on every node
     except BaseException as error:
         _open.pop(new.name, None)
         all_raise = comm.size == 1 or isinstance(error, Stopped | WriteError)
@@ -112,9 +111,9 @@ def create_export(path: Path, layout: Layout, provenance: Mapping[str, Any], ove
     with file_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     size = sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in layout.values())
-    with new_file(MPI.COMM_SELF, path, checksums=False) as file:
+    with new_file(MPI.COMM_SELF, path) as file:
         with writing(file, size + overhead):  # the margin has room for headers and attributes
-            file.attrs["provenance"] = json.dumps(dict(provenance))
+            set_attributes(file, {"provenance": json.dumps(dict(provenance))})
             for name, (shape, dtype) in layout.items():
                 file.create_dataset(name, shape, dtype)
         yield file
@@ -138,6 +137,11 @@ def writing(group: h5py.Group | h5py.Dataset, size: int) -> Iterator[None]:
                            "check the disk, then run the command again") from None
 
 
+def writes_first(group: h5py.Group | h5py.Dataset) -> bool:
+    """Return whether this rank is the first of those that write the file."""
+    return _open[group.file.filename].comm.rank == 0
+
+
 def writing_failed() -> bool:
     """Return whether HDF5 failed to write a file. The process then crashes at its end unless it is aborted."""
     return any(new.broken for new in _abandoned)
@@ -149,6 +153,17 @@ def require_parallel_hdf5(comm: MPI.Comm) -> None:
         raise UserError(f"{comm.size} ranks need an h5py with MPI, and this one has none; run mpi_tools/bootstrap.sh, "
                         "or `CC=mpicc HDF5_MPI=ON pip install --no-binary=h5py --no-build-isolation h5py`; one rank "
                         "works with any h5py")
+
+
+def set_attributes(item: h5py.Group | h5py.Dataset, values: Mapping[str, Any]) -> None:
+    """Set attributes of a group or dataset; collective. Texts are stored with a fixed length, in UTF-8, because HDF5
+    has no checksum of texts of variable length."""
+    for name, value in values.items():
+        if isinstance(value, str):
+            text = value.encode()
+            item.attrs.create(name, text, dtype=h5py.string_dtype("utf-8", max(len(text), 1)))
+        else:
+            item.attrs[name] = value
 
 
 def frame_bytes(dataset: h5py.Dataset) -> int:
@@ -206,7 +221,7 @@ class _NewFile:
         """Write an empty HDF5 file on rank 0. Without it, HDF5 could not even close the file on a full disk."""
         if self.comm.rank == 0:
             empty = io.BytesIO()
-            h5py.File(empty, "w").close()
+            h5py.File(empty, "w", libver=LAYOUT).close()
             try:
                 # Make a new inode: a file left open after an error may still use the old one.
                 self.path.unlink(missing_ok=True)
@@ -218,11 +233,11 @@ class _NewFile:
     def _open_file(self) -> None:
         self._stream: BinaryIO | None = None
         if self.comm.size > 1:
-            self.file = h5py.File(self.path, "r+", driver="mpio", comm=self.comm)
+            self.file = h5py.File(self.path, "r+", driver="mpio", comm=self.comm, libver=LAYOUT)
         else:
             # With a file object of Python, HDF5 uses no file lock, which some network file systems lack.
             self._stream = open(self.path, "r+b")
-            self.file = h5py.File(self._stream, "r+")
+            self.file = h5py.File(self._stream, "r+", libver=LAYOUT)
 
     def _reserve_until(self, stop: int) -> None:
         limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]  # of this process

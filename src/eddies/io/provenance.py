@@ -14,8 +14,9 @@ import numpy as np
 from mpi4py import MPI
 
 import eddies
-from eddies.io.checksums import open_to_read
-from eddies.io.errors import ProductError
+from eddies.io.damage import open_to_read
+from eddies.io.errors import ContentError, ProductError
+from eddies.io.quantities import python_value
 from eddies.kernels.library import in_use
 from eddies.pipeline import MAKER_OF
 
@@ -77,7 +78,8 @@ def product_provenance(path: str | Path) -> dict[str, Any]:
 
 def product_attributes(path: str | Path, group: str) -> dict[str, Any]:
     """Return the attributes of a group of a complete product of this format; empty if there is no such product."""
-    return _read_sound(path, lambda file: dict(file[group].attrs))
+    return _read_sound(path, lambda file: {
+        key: python_value(value) for key, value in file[group].attrs.items()})
 
 
 def product_fingerprint(path: str | Path) -> str | None:
@@ -129,8 +131,8 @@ def _read_sound(path: str | Path, read: Callable[[h5py.File], dict[str, Any]]) -
         return {}
 
 
-def _damaged(file: h5py.File, name: str) -> ProductError:
-    return ProductError(f"{file.filename}: its attribute {name} is missing or not valid, the file is damaged; make it "
+def _damaged(file: h5py.File, name: str) -> ContentError:
+    return ContentError(f"{file.filename}: its attribute {name} is missing or not valid, the file is damaged; make it "
                         "again")
 
 

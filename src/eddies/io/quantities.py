@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
+from eddies.io.new_files import set_attributes
+
 # The origin of the times in a product, by kind.
 BEGINNING = {"ground_truth": "since the release of the tracers", "reconstruction": "since the first frame",
              "rollout": "since the start of the rollout"}
@@ -129,13 +131,15 @@ def conventions(kind: str) -> dict[str, str]:
 
 def python_value(value: Any) -> Any:
     """Return a number or text of an attribute as a Python object."""
+    if isinstance(value, bytes):
+        return value.decode()
     return value.item() if isinstance(value, np.generic) else value
 
 
 def describe(dataset: h5py.Dataset) -> None:
     """Write the attributes `units`, `axes` and `description` of a dataset, if its path is known; collective."""
-    for name, words in dataset_attributes(dataset.file.attrs.get("kind", ""), dataset.name.strip("/")).items():
-        dataset.attrs[name] = words
+    kind = python_value(dataset.file.attrs.get("kind", ""))
+    set_attributes(dataset, dataset_attributes(kind, dataset.name.strip("/")))
 
 
 def dataset_attributes(kind: str, path: str) -> dict[str, str]:

@@ -10,6 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.io.hdf5 import ProductError, create_product, in_files, open_product, read_table, write_table
+from eddies.io.new_files import set_attributes
 from eddies.io.provenance import read_json, read_provenance
 
 
@@ -38,7 +39,7 @@ def save_weights(comm: MPI.Comm, path: str | Path, kind: str, description: Mappi
             if not np.isfinite(tensor).all():
                 raise ProductError(f"{path}: tensor {name} is not finite, so nothing is written; lower learning_rate")
         with create_product(MPI.COMM_SELF, path, kind, {"ranks": comm.size, **provenance}) as file:
-            file.attrs["description"] = json.dumps(dict(description))
+            set_attributes(file, {"description": json.dumps(dict(description))})
             write_table(file, "weights", tensors)
             for name, columns in (tables or {}).items():
                 write_table(file, name, columns)

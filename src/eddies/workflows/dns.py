@@ -17,7 +17,7 @@ from eddies.io.checkpoint import Checkpoint, Guard
 from eddies.io.fields import FieldWriter
 from eddies.io.frame_segments import FrameSegments
 from eddies.io.hdf5 import File, ProductError, create_product, in_files, open_product, write_table
-from eddies.io.new_files import write_files
+from eddies.io.new_files import set_attributes, write_files
 from eddies.io.provenance import product_fingerprint, product_provenance
 from eddies.io.run_lock import lock_directory
 from eddies.io.trajectories import Trajectory
@@ -161,19 +161,19 @@ def write_tracers(file: File, tracers: TracerRun, name: str, forcing: Forcing | 
     release, `forcing` is written, too."""
     tracers.segments.assemble(file, series_of(name))
     if tracers.flow.fluid.forcing is not None:
-        file.create_group("forcing").attrs.update(asdict(forcing))
+        set_attributes(file.create_group("forcing"), asdict(forcing))
     tracers.sets[name].write_spectra(file)
 
 
 def write_flow(file: File, flow: FlowRun, scales: Mapping[str, float], spin_up: SpinUp | None) -> None:
     """Write the scales and the statistics of a flow; collective."""
-    file.create_group("reference").attrs.update({
+    set_attributes(file.create_group("reference"), {
         **scales, "viscosity": flow.fluid.viscosity, "energy_budget_error": flow.history.budget_error})
     write_table(file, "statistics", flow.history.columns())
     energy = np.array(flow.history.spectra)
     write_table(file, "spectra_of_statistics", {"wavenumber": np.arange(energy.shape[1]), "energy": energy})
     if spin_up is not None and spin_up.stationary is not None:
-        file.create_group("stationary").attrs.update(stationary_span(spin_up, flow.history))
+        set_attributes(file.create_group("stationary"), stationary_span(spin_up, flow.history))
 
 
 def holds_frames(comm: Comm, product: Path, count: int) -> bool:

@@ -32,6 +32,7 @@ import torch
 from eddies.clock import ROUND_OFF
 from eddies.import_path import is_path
 from eddies.io.hdf5 import create_product, write_table
+from eddies.io.new_files import set_attributes
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import IdOrder
 from eddies.parallel.stop import StopRequest
@@ -239,7 +240,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     seconds = time.perf_counter() - began
     provenance = stage_provenance(scene, "find-step")
     with create_product(comm, directory / STAGES["find-step"].file, "step", provenance) as file:
-        file.create_group("found").attrs.update({
+        set_attributes(file.create_group("found"), {
             "integrator": found.step.integrator, "size": found.step.size, "seconds_per_turnover": found.seconds,
             "error": found.error, "error_with_half": half.error, "difference": difference,
             "tolerance": half.tolerance, "seconds": seconds, "confirmed_on": len(truths) - 1,

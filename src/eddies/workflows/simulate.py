@@ -12,6 +12,7 @@ from eddies.clock import pace_in_words
 from eddies.io.frame_segments import FrameSegments
 from eddies.io.checkpoint import Guard
 from eddies.io.hdf5 import create_product, write_table
+from eddies.io.new_files import set_attributes
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
@@ -55,7 +56,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             outcome = course.run()
             with create_product(comm, directory / STAGES["simulate"].file, "rollout", provenance) as file:
                 segments.assemble(file)
-                file.create_group("rollout").attrs.update({
+                set_attributes(file.create_group("rollout"), {
                     **outcome, **method.description(), "method": settings.method,
                     "turnovers": outcome["time"] / turnover,
                     "injection_rate": forcing.injection_rate if forcing else 0.0,

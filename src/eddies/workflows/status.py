@@ -8,12 +8,11 @@ from pathlib import Path
 from eddies.clock import duration
 from eddies.errors import UserError
 from eddies.io.checkpoint import checkpoints_in
-from eddies.io.checksums import ATTRIBUTE, find_damage, open_to_read
+from eddies.io.damage import find_damage
 from eddies.io.errors import ProductError, remedy_for
 from eddies.io.hdf5 import in_files
 from eddies.io.provenance import product_fingerprint, product_provenance
 from eddies.io.run_lock import job_in
-from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.scene import Scene, SceneError, load_scene
@@ -28,8 +27,8 @@ SCENE, PAGE = "scene.toml", Path("report") / "index.html"
 def run(directory: Path, comm: Comm, verify: bool = False) -> None:
     """Print a line for each stage of a run, or of all runs in a directory; all ranks call it.
 
-    With `verify` the ranks also compare all bytes of the products with their checksums, and print a line for each
-    product. Raises UserError if a product is damaged or cannot be read.
+    With `verify` the ranks also read all of the products, so that HDF5 compares them with their checksums, and print a
+    line for each product. Raises UserError if a product is damaged or cannot be read.
     """
     for line in in_files(comm, directory, lambda: list(status_lines(directory))):
         _print(comm, line)
@@ -37,11 +36,9 @@ def run(directory: Path, comm: Comm, verify: bool = False) -> None:
         return
     products, damaged = in_files(comm, directory, lambda: products_in(directory)), 0
     for path in products:
-        old = on_first_rank(comm, lambda: before_checksums(path))
-        complaint = None if old else _complaint(comm, path)
+        complaint = _complaint(comm, path)
         damaged += complaint is not None
-        state = "has no checksums, because an earlier version made it" if old else "unchanged since it was written"
-        _print(comm, complaint or f"{path}: {state}")
+        _print(comm, complaint or f"{path}: not damaged")
     if damaged:
         raise UserError(f"{directory}: {damaged} of {len(products)} products are damaged or cannot be read")
 
@@ -60,15 +57,6 @@ def products_in(directory: Path) -> list[Path]:
     names = [stage.file for stage in STAGES.values() if stage.product]
     found = sorted((path for name in names for path in directory.rglob(name)), key=Path.is_symlink, reverse=True)
     return sorted({path.resolve(): path for path in found}.values())
-
-
-def before_checksums(path: Path) -> bool:
-    """Return whether a product was written by a version without checksums."""
-    try:
-        with open_to_read(path) as file:
-            return ATTRIBUTE not in file.attrs
-    except ProductError:
-        return False
 
 
 def _print(comm: Comm, line: str) -> None:

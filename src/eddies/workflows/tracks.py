@@ -19,6 +19,7 @@ from eddies.analysis.isotropic_turbulence import dissipation_constant
 from eddies.flow.statistics import component_energies, energy_spectrum, gradient_moments, turbulence_scales
 from eddies.io.fields import FieldWriter
 from eddies.io.hdf5 import File, create_product, in_files, write_table
+from eddies.io.new_files import set_attributes
 from eddies.io.trajectories import TrajectoryWriter
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import IdOrder, id_block, migrate
@@ -148,10 +149,10 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         sound = {"sound_speed": scene.flow.sound_speed or math.inf}
         if scene.flow.compressible:
             sound["mach_turbulent"] = math.sqrt(2 * energy) / scene.flow.sound_speed
-        file.create_group("reference").attrs.update({**reference, "released_at": 0.0, "energy": energy, **sound})
+        set_attributes(file.create_group("reference"), {**reference, "released_at": 0.0, "energy": energy, **sound})
         write_table(file, "statistics", {name: np.array([row[name] for row in rows]) for name in rows[0]})
         write_table(file, "spectra", {"wavenumber": np.arange(spectra["energy"].shape[1]), **spectra})
-        file.create_group("tracks").attrs.update({
+        set_attributes(file.create_group("tracks"), {
             **tracks.about, "complete": tracks.complete, "mean_count": tracks.mean_count, "weight": flows.weight,
             **({} if math.isnan(flows.error) else {"validation_error": flows.error}), "traced": follows})
     log.info("dns: %d tracks, on average %.0f in a frame; %d are in each of the %d frames; duration %.3g T, u' = %.3g, "

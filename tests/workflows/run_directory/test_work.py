@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from eddies.io import checksums
+from eddies.io import damage
 from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.hdf5 import ProductError, create_product
 from eddies.pipeline import STAGES
@@ -184,11 +184,11 @@ def test_checkpoints_of_another_format_and_unreadable_products_are_not_replaced(
 
     leave(comm, tmp_path, scene, ["dns"])
     with monkeypatch.context() as patch, pytest.raises(ProductError, match="ground_truth.h5: cannot be read: Input"):
-        patch.setattr(checksums, "_opened", refuse)
+        patch.setattr(damage, "_opened", refuse)
         find_work(scene.stages, scene, tmp_path)
     save(comm, tmp_path, scene, "dns", 5)
     with monkeypatch.context() as patch, pytest.raises(ProductError, match="step-00000005.h5: cannot be read: Input"):
-        patch.setattr(checksums, "_opened", refuse)
+        patch.setattr(damage, "_opened", refuse)
         find_work(["dns"], scene, tmp_path)
     (tmp_path / "ground_truth.h5").write_bytes(b"damaged")
     with pytest.raises(WouldReplaceWork, match=r"ground_truth.h5 \(damaged"):

@@ -19,7 +19,7 @@ import numpy as np
 from eddies.clock import duration
 from eddies.errors import UserError
 from eddies.io.checkpoint import checkpoints_in
-from eddies.io.checksums import open_to_read
+from eddies.io.damage import open_to_read
 from eddies.io.errors import ContentError, ProductError
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.provenance import product_fingerprint, product_provenance
