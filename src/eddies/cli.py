@@ -26,7 +26,7 @@ from eddies.cores import check_threads, default_to_one_thread
 from eddies.errors import UserError
 from eddies.logs import OUTCOME, Output, configure_logging, show_warnings
 from eddies.pipeline import STAGES
-from eddies.scene.scene import Scene, SceneError, builtin_scenes, load_scene
+from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 
 if TYPE_CHECKING:
     from eddies.parallel.communicator import Comm
@@ -102,12 +102,11 @@ def run(arguments: list[str] | None) -> int:
     try:
         require_same(comm, shlex.join(sys.argv[1:] if arguments is None else arguments), "the arguments {}")
         options = parse_arguments(arguments, comm.rank)
-        configure_logging(comm.rank, getattr(options, "log", None))
+        configure_logging(comm.rank, getattr(options, "log", None),
+                          sys.stderr if getattr(options, "json", False) else None)
         check_threads()
         library()  # sets the threads, which torch shares
-        if options.command == "check" and options.time:
-            time_command(options, comm, signals)
-        elif options.command in SHORT_COMMANDS:
+        if options.command in SHORT_COMMANDS:
             release_signals(signals)
             SHORT_COMMANDS[options.command](options, comm)
         else:
@@ -242,21 +241,10 @@ def export_command(options: argparse.Namespace, comm: Comm) -> None:
 
 def check_command(options: argparse.Namespace, comm: Comm) -> None:
     """Log estimates for a run of a scene, or of each variant that the command line names."""
-    for scene in checked_scenes(options):
-        import_module("eddies.workflows.check").run(scene, comm, options.json)
-
-
-def time_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
-    """Measure how long a step of each stage takes, for a scene or for each variant that the command line names."""
-    for scene in checked_scenes(options):
-        import_module("eddies.workflows.timing").run(scene, comm, signals)
-
-
-def checked_scenes(options: argparse.Namespace) -> list[Scene]:
-    """Return the variants that the command line names, or the whole scene if it names none."""
     whole = load_scene(options.scene, options.overrides, options.removals)
     whole.check_variants(options.variants)
-    return [whole.variant[name] for name in options.variants] or [whole]
+    for scene in [whole.variant[name] for name in options.variants] or [whole]:
+        import_module("eddies.workflows.check").run(scene, comm, options.json)
 
 
 def scenes_command(options: argparse.Namespace, comm: Comm) -> None:

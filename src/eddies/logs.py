@@ -7,7 +7,7 @@ import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from eddies.errors import UserError
 
@@ -15,8 +15,8 @@ OUTCOME = (logging.INFO + logging.WARNING) // 2  # level of the line about the f
 LEVELS = {"debug": logging.DEBUG, "info": logging.INFO, "outcome": OUTCOME, "warning": logging.WARNING}
 
 
-def configure_logging(rank: int, level: str | None = None) -> None:
-    """Send the lines of the logger "eddies" to standard output.
+def configure_logging(rank: int, level: str | None = None, stream: TextIO | None = None) -> None:
+    """Send the lines of the logger "eddies" to `stream`, by default standard output.
 
     `level` is the level of rank 0: debug, info, outcome or warning. If it is None, the variable EDDIES_LOG gives the
     level; without the variable it is info. Raises UserError if EDDIES_LOG has another value.
@@ -24,7 +24,7 @@ def configure_logging(rank: int, level: str | None = None) -> None:
     name = level or os.environ.get("EDDIES_LOG", "info")
     if name not in LEVELS:
         raise UserError(f"EDDIES_LOG = {name}: must be one of {', '.join(LEVELS)}")
-    handler = logging.StreamHandler(sys.stdout)
+    handler = logging.StreamHandler(stream or sys.stdout)
     handler.setFormatter(_RankFormatter(rank))
     logger = logging.getLogger("eddies")
     logger.handlers, logger.propagate = [handler], False
