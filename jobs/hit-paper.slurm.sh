@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # sbatch jobs/hit-paper.slurm.sh [options of `eddies dns`]
 # Ground truth of the scene hit-paper: 1024^3 cells on 256 ranks, 64 on each of four nodes, about 84 GB of memory per
-# node. `eddies check hit-paper` on ranks of your cluster estimates the hours. A job that reaches its time limit is
-# queued again and continues. The later stages use at most 22 ranks. Submit them afterwards:
+# node. Time a hundred steps first (docs/clusters.md). A job that reaches its time limit is queued again and continues.
+# The later stages use at most 22 ranks. Submit them afterwards:
 #   EDDIES_SCENE=hit-paper sbatch --ntasks-per-node=22 jobs/slurm.sh
 # Submit from the checkout, or set EDDIES_CHECKOUT to it. Load your cluster's modules first, as for set-up.
 #SBATCH --job-name=hit-paper

@@ -22,8 +22,8 @@ from eddies.scene.rules import quoted
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError, Tracers, builtin_scenes, load_scene
 from eddies.scene.sections import METHODS, SET_KEYS, Simulation
 from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS
-from eddies.workflows.foreseen.numbers import estimate
-from eddies.workflows.foreseen.ranks import most_ranks
+from eddies.workflows.estimates import estimate
+from eddies.workflows.resources import most_ranks
 from tests.commands import python
 
 CHECKOUT = Path(__file__).parents[1]
@@ -174,11 +174,11 @@ def test_the_scene_with_an_own_pair_force_differs_from_the_published_system_in_t
 def test_numbers_of_the_own_flow_follow_its_rules(folder):
     """Those of docs/own-flow.md, which `eddies check` prints."""
     scene = load_scene("my-flow.toml")
-    expected = estimate(scene).turbulence
-    assert 1.2 < scene.flow.cells // 3 * expected.kolmogorov_length < 1.25
-    assert scene.tracers.frame_interval == pytest.approx(expected.kolmogorov_time / 3, rel=0.05)
-    assert scene.time.max_step == pytest.approx(expected.kolmogorov_time / 30, rel=0.05)
-    assert scene.tracers.filter_width == pytest.approx(36 * expected.kolmogorov_length, rel=0.02)
+    expected = estimate(scene).scales
+    assert 1.2 < scene.flow.cells // 3 * expected["kolmogorov_length"] < 1.25
+    assert scene.tracers.frame_interval == pytest.approx(expected["kolmogorov_time"] / 3, rel=0.05)
+    assert scene.time.max_step == pytest.approx(expected["kolmogorov_time"] / 30, rel=0.05)
+    assert scene.tracers.filter_width == pytest.approx(36 * expected["kolmogorov_length"], rel=0.02)
     text = (CHECKOUT / "docs/own-flow.md").read_text(encoding="utf-8")
     ranks = [min(most_ranks(each).values()) for each in (scene.ground_truth_alone, scene)]
     assert f"| {ranks[0]}, {ranks[1]} |" in text and f"--ntasks-per-node={ranks[1]} " in text

@@ -81,7 +81,8 @@ def run(arguments: list[str] | None) -> int:
     try:
         require_same(comm, shlex.join(sys.argv[1:] if arguments is None else arguments), "the arguments {}")
         options = parse_arguments(arguments, comm.rank)
-        configure_logging(comm.rank, getattr(options, "log", None))
+        configure_logging(comm.rank, getattr(options, "log", None),
+                          sys.stderr if getattr(options, "json", False) else None)
         require_parallel_hdf5(comm)
         check_threads()
         library()  # sets the threads, which torch shares
@@ -209,16 +210,11 @@ def export_command(options: argparse.Namespace, comm: Comm) -> None:
 
 
 def check_command(options: argparse.Namespace, comm: Comm) -> None:
-    """Log estimates for a run of a scene, or of each variant that the command line names. With --time, measure how long
-    a step of each stage takes."""
-    signals = catch_signals() if options.time else []
+    """Log estimates for a run of a scene, or of each variant that the command line names."""
     whole = load_scene(options.scene, options.overrides, options.removals)
     whole.check_variants(options.variants)
     for scene in [whole.variant[name] for name in options.variants] or [whole]:
-        if options.time:
-            import_module("eddies.workflows.timing").run(scene, comm, signals)
-        else:
-            import_module("eddies.workflows.check").run(scene, comm, options.json)
+        import_module("eddies.workflows.check").run(scene, comm, options.json)
 
 
 def scenes_command(options: argparse.Namespace, comm: Comm) -> None:

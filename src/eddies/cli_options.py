@@ -23,8 +23,7 @@ EXAMPLES = {
     "simulate": ("eddies simulate hit-small --overwrite --set simulation.method=none",),
     "report": ("eddies report runs/hit-small --open",),
     "export": ("eddies export runs/tiny --format vtkhdf", "eddies export runs/hit --format lagrangebench"),
-    "check": ("eddies check hit", "eddies check mine.toml --set flow.cells=256 --unset forcing --json",
-              "mpirun -n 2 eddies check hit-small --time"),
+    "check": ("eddies check hit", "eddies check mine.toml --set flow.cells=256 --unset forcing --json"),
     "scenes": ("eddies scenes", "eddies scenes tiny"),
     "status": ("eddies status", "eddies status runs/hit-small --verify"),
     "diff": ("eddies diff runs/hit-small runs/second", "eddies diff runs/cost --variant learned --variant paper"),
@@ -70,12 +69,10 @@ def build_parser() -> argparse.ArgumentParser:
                         help="vtkhdf: for ParaView; lagrangebench: for learned simulators (default: vtkhdf)")
     export.add_argument("--output", type=directory, metavar="DIR", help="where the files go (default: RUN/FORMAT)")
     add_log_options(export)
-    check = add_command(commands, "check", "derived numbers, memory, ranks and time; writes no files")
+    check = add_command(commands, "check", "derived numbers, memory, disk and ranks; writes no files")
     add_scene_options(check)
     add_variants(check, "check this variant in place of the scene; repeatable")
-    how = check.add_mutually_exclusive_group()
-    how.add_argument("--json", action="store_true", help="the numbers as JSON, for programs")
-    how.add_argument("--time", action="store_true", help="run a few steps of each stage, and estimate its time")
+    check.add_argument("--json", action="store_true", help="the numbers as JSON, for programs")
     scenes = add_command(commands, "scenes", "the built-in scenes, one per line; or one scene with all settings")
     scenes.add_argument("scene", nargs="?", metavar="SCENE",
                         help="print this scene with all possible keys; absent ones are comments")

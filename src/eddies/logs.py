@@ -5,6 +5,7 @@ import os
 import sys
 import warnings
 from pathlib import Path
+from typing import TextIO
 
 from eddies.errors import UserError
 
@@ -12,8 +13,8 @@ OUTCOME = (logging.INFO + logging.WARNING) // 2  # level of the line about the f
 LEVELS = {"debug": logging.DEBUG, "info": logging.INFO, "outcome": OUTCOME, "warning": logging.WARNING}
 
 
-def configure_logging(rank: int, level: str | None = None) -> None:
-    """Send the lines of the logger "eddies" to standard output.
+def configure_logging(rank: int, level: str | None = None, stream: TextIO | None = None) -> None:
+    """Send the lines of the logger "eddies" to `stream`, by default standard output.
 
     `level` is the level of rank 0: debug, info, outcome or warning. If it is None, the variable EDDIES_LOG gives the
     level; without the variable it is info. Raises UserError if EDDIES_LOG has another value.
@@ -21,7 +22,7 @@ def configure_logging(rank: int, level: str | None = None) -> None:
     name = level or os.environ.get("EDDIES_LOG", "info")
     if name not in LEVELS:
         raise UserError(f"EDDIES_LOG = {name}: must be one of {', '.join(LEVELS)}")
-    handler = logging.StreamHandler(sys.stdout)
+    handler = logging.StreamHandler(stream or sys.stdout)
     handler.setFormatter(_RankFormatter(rank))
     handler.handleError = lambda record: None  # a run goes on if a line cannot be written, as to a closed pipe
     logger = logging.getLogger("eddies")

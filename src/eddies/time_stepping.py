@@ -103,8 +103,6 @@ class RungeKutta4:
     """The classical explicit Runge-Kutta method of fourth order, for L and N alike. It serves for comparisons of error
     and run time."""
 
-    evaluations = 4
-
     def __init__(self, equation: Any) -> None:
         self.equation = equation
 

@@ -1,7 +1,7 @@
 """Cost of an evaluation of a particle model over particles, ranks and threads: measurements, bounds and figure.
 
     OMP_NUM_THREADS=1 .venv/bin/python tests/benchmarks/performance.py measure docs/performance.json  # 10 min
-    .venv/bin/python tests/benchmarks/projection.py particles docs/performance.json  # projection to more cores
+    .venv/bin/python tests/benchmarks/projection.py docs/performance.json  # projection to more cores
     .venv/bin/python tests/benchmarks/performance.py draw docs/performance.json docs/performance.png
 
 Runs other programs of this folder: `particle_step.py` on one rank, on one rank with two threads and on two ranks, and
@@ -24,10 +24,11 @@ from mpi4py import MPI
 from step import best, transform_bounds
 
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.flow_units import resolved_shells
 from eddies.report.figures import FOURTH, MODEL, SECOND, THIRD, TRUTH, letter, panels, png, styled
-from eddies.scene.scene import Scene, load_scene
+from eddies.scene.scene import BOX_LENGTH, Scene, load_scene
 from eddies.spectral.spectral_grid import SpectralGrid
-from eddies.workflows.foreseen.numbers import estimate
+from eddies.workflows.estimates import estimate
 from eddies.workflows.variant_rows import processor
 
 HERE = Path(__file__).parent
@@ -76,13 +77,20 @@ def scene_of(side: int, model: str) -> Scene:
                       ["variant"])
 
 
+def shells_of(scene: Scene) -> int:
+    """Highest wavenumber of the resolved velocity."""
+    tracers = scene.tracers
+    return resolved_shells(tracers.spacing, tracers.filter_width, estimate(scene).scales["kolmogorov_length"],
+                           BOX_LENGTH, tracers.planes)
+
+
 def bounds(iterations: float) -> dict[str, float]:
     """Lower bounds of the seconds of parts of an evaluation with 64^3 particles on one core."""
     a, b = np.ones((2, 1024, 1024), np.float32)
     flops = 2 * 1024**3 / best(lambda: a @ b)
     scene = scene_of(64, MODELS[1])
     particles, slab = scene.tracers.particles, SlabDecomposition(MPI.COMM_SELF, 2 * math.pi, scene.tracers.planes)
-    grid = SpectralGrid(slab, "float32", estimate(scene).resolved_shells)
+    grid = SpectralGrid(slab, "float32", shells_of(scene))
     return {"flops": flops,
             "pairs": particles * scene.neighbors / 2 * PAIR_FLOPS / flops,
             "transforms": sum(transform_bounds(grid, 1, 1, 1).values()) * (6 * iterations + TRANSFORMED) / 2,

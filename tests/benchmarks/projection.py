@@ -1,12 +1,10 @@
-"""Projected cost of an evaluation of the particles on up to 4096 cores, and of the direct simulation on many ranks.
+"""Projected cost of an evaluation of the particles on up to 4096 cores.
 
-    .venv/bin/python tests/benchmarks/projection.py particles docs/performance.json
-    .venv/bin/python tests/benchmarks/projection.py flow hit-paper
+    .venv/bin/python tests/benchmarks/projection.py docs/performance.json
 
-`particles` measures nothing: seconds of a call and of a unit of work of each part follow from the measured evaluations
-of 16^3 and 64^3 particles on one core; messages are those of an assumed network. It writes the rows `projected` into
-the file, and prints the table of docs/performance.md and the deviation of the projection from the measurements. `flow`
-prints the formulas of `eddies check` for 1, 2, 4, ... ranks.
+This measures nothing: seconds of a call and of a unit of work of each part follow from the measured evaluations of 16^3
+and 64^3 particles on one core; messages are those of an assumed network. It writes the rows `projected` into the file,
+and prints the table of docs/performance.md and the deviation of the projection from the measurements.
 """
 
 import argparse
@@ -16,14 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from performance import INTERPOLATED, MODELS, TRANSFORMED, scene_of
+from performance import INTERPOLATED, MODELS, TRANSFORMED, scene_of, shells_of
 
-from eddies.clock import duration
-from eddies.scene.scene import BOX_LENGTH, Scene, load_scene
-from eddies.workflows.foreseen.numbers import estimate
-from eddies.workflows.foreseen.ranks import most_ranks
-from eddies.workflows.foreseen.seconds import seconds
-from eddies.workflows.foreseen.storage import flow_memory, in_units
+from eddies.scene.scene import BOX_LENGTH, Scene
+from eddies.workflows.resources import most_ranks
 
 SIDES, TABLE_CORES, MOST_CORES = (64, 128, 256, 512), (16, 64, 256, 1024, 4096), 4096
 # The cluster: cores of a node; bytes a second of a rank within its node, and of a node to all others; seconds of a
@@ -68,7 +62,7 @@ class Job:
         return {"pairs": own * self.scene.neighbors / 2 * (1 + doubled) * paired,
                 "splines": self.components("splines") * own,
                 "transforms": self.components("transforms") * points * growth(tracers.planes),
-                "modes": self.iterations * estimate(self.scene).resolved_shells ** 3 * self.share, "formulas": own,
+                "modes": self.iterations * shells_of(self.scene) ** 3 * self.share, "formulas": own,
                 "settling": own * (MIGRATION if self.ranks > 1 else 1.0)}
 
     def messages(self) -> float:
@@ -76,7 +70,7 @@ class Job:
         that migrate, and sums along a tree."""
         if self.ranks == 1:
             return 0.0
-        tracers, k = self.scene.tracers, estimate(self.scene).resolved_shells
+        tracers, k = self.scene.tracers, shells_of(self.scene)
         on_node = min(self.ranks, max(NODE_CORES // self.threads, 1))
         own = self.components("transforms") * tracers.planes * (2 * k + 1) * (k + 1) * 8 / self.ranks
         calls = 2 * self.iterations + CALLS
@@ -163,28 +157,13 @@ def table(found: dict) -> str:
     return "\n".join(lines)
 
 
-def flow_table(scene: Scene) -> str:
-    """Memory of a rank, seconds a step and wall time of the direct simulation by ranks."""
-    lines, steps = ["ranks  planes  memory a rank  s a step     wall time"], estimate(scene).steps
-    for ranks in (2**m for m in range(min(most_ranks(scene.ground_truth_alone).values()).bit_length())):
-        whole = seconds(scene, "dns", ranks)
-        size = in_units(flow_memory(scene.flow, scene.tracers, ranks))
-        lines.append(f"{ranks:5}  {math.ceil(scene.flow.cells / ranks):6}  {size:>13}  {whole / steps:8.3g}  "
-                     f"{duration(whole):>12}")
-    return "\n".join(lines)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("action", choices=("particles", "flow"))
-    parser.add_argument("subject", help="the file of results, or a scene")
-    options = parser.parse_args()
-    if options.action == "flow":
-        print(flow_table(load_scene(options.subject)))
-        return
-    found = json.loads(Path(options.subject).read_text())
+    parser.add_argument("file", type=Path, help="the file of results")
+    file = parser.parse_args().file
+    found = json.loads(file.read_text())
     found["projected"] = projected(found)
-    Path(options.subject).write_text(json.dumps(found, indent=1) + "\n")
+    file.write_text(json.dumps(found, indent=1) + "\n")
     print(table(found))
     print("deviation:", ", ".join(f"{side}³ {deviation:.0%}" for side, deviation in deviations(found).items()))
 

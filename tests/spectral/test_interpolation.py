@@ -1,5 +1,7 @@
 """Values at points of slabs."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from eddies.flow.initial_fields import random_velocity
 from eddies.parallel.halo import HaloError
 from eddies.parallel.reduction import global_max, global_sum
 from eddies.parallel.slab import SlabDecomposition
-from eddies.spectral.interpolation import SplineInterpolation
+from eddies.spectral.interpolation import SplineInterpolation, margin_for, spline_ranks
 from eddies.spectral.spectral_grid import SpectralGrid
 
 LENGTH = 5.0
@@ -33,6 +35,17 @@ def test_interpolation_order_against_direct_fourier_sums(comm, kind, order):
         error = np.abs(spline.at(spline.coefficients(modes), position[near]) - exact[near]).max(initial=0)
         errors.append(float(global_max(comm, error)))
     assert np.log2(errors[0] / errors[1]) > order - 0.5
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("kind, distance, most", [("cubic", 0.0, 3), ("quintic", 0.0, 2), ("cubic", 1.1, 2)])
+def test_the_usable_ranks_are_those_that_splines_accept(comm, kind, distance, most):
+    """Nine planes; points are up to 1.1 spacings outside their slab, which takes two more planes."""
+    grid = SpectralGrid(SlabDecomposition(comm, LENGTH, 9))
+    margin = margin_for(distance * LENGTH / 9, LENGTH / 9)
+    assert spline_ranks(9, kind, margin) == most
+    with nullcontext() if comm.size <= most else pytest.raises(HaloError, match=f"at most {most} ranks"):
+        SplineInterpolation(grid, kind, margin)
 
 
 @pytest.mark.mpi(2)

@@ -86,21 +86,18 @@ def check_words(path, dataset):
 
 
 def test_what_check_foresees_is_what_was_run(run_directory):
-    from eddies.workflows.foreseen.numbers import estimate, rollout_in
-    from eddies.workflows.foreseen.storage import rollout_bytes, storage, trajectory_bytes
+    from eddies.workflows.estimates import estimate
     from eddies.workflows.ground_truth.frame_counts import unfiltered_frames
+    from eddies.workflows.resources import rollout_bytes, storage, trajectory_bytes
     scene = load_scene(TINY, CHANGES)
-    expected = estimate(scene)
     with h5py.File(run_directory / "rollout.h5") as file:
-        rollout = dict(file["rollout"].attrs)
+        stored = len(file["particles/model/time"])
     with h5py.File(run_directory / "ground_truth.h5") as file:
         frames, measured = len(file["particles/tracers/time"]), file["reference"].attrs["mach_turbulent"]
-    course = rollout_in(scene.simulation, rollout["eddy_turnover_time"], expected.rollout_step)
-    assert (course.steps, course.evaluations) == (rollout["steps"], rollout["evaluations"]) == (9, 28)
-    assert expected.mach == pytest.approx(measured, rel=0.5)
+    assert estimate(scene).mach == pytest.approx(measured, rel=0.5)
     whole = len(unfiltered_frames(scene.simulation, scene.training, scene.tracers.field_every, frames))
     sizes = {"ground_truth": trajectory_bytes(scene.flow, scene.tracers, frames, whole),
-             "rollout": rollout_bytes(scene.tracers.particles, course.intervals + 1),
+             "rollout": rollout_bytes(scene.tracers.particles, stored),
              "kernel": storage(scene, "train-kernel", 1).kept, "model": storage(scene, "train", 1).kept}
     for name, size in sizes.items():
         assert (run_directory / f"{name}.h5").stat().st_size == pytest.approx(size, rel=0.2), name

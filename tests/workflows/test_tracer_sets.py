@@ -1,6 +1,5 @@
 """Several sets of tracers in one direct simulation: each has the ground truth that it has alone."""
 
-import re
 import shutil
 
 import numpy as np
@@ -12,7 +11,7 @@ from eddies.io.provenance import product_provenance
 from eddies.io.run_lock import RunInUse, lock_directory
 from eddies.parallel.stop import Stopped
 from eddies.scene.scene import SceneError, Tracers, load_scene
-from eddies.workflows import dns, timing
+from eddies.workflows import dns
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import find_work
 from eddies.workflows.status import status_lines
@@ -149,14 +148,6 @@ def test_a_stopped_simulation_with_sets_goes_on_for_longer(comm, tmp_path, caplo
     dns.run(longer, comm, tmp_path)
     assert "continues from step 11" in caplog.text
     assert start(load_scene(TINY, [*SPLIT, *SETS]), tmp_path) == "anew"
-
-
-@pytest.mark.mpi(1)
-def test_a_scene_with_sets_is_measured(comm, tmp_path, monkeypatch, caplog, no_figures):
-    monkeypatch.chdir(tmp_path)
-    caplog.set_level("INFO", "eddies")
-    timing.run(load_scene(with_variants(tmp_path, a="few"), [*SPLIT, *SETS, "simulation.method=none"]), comm)
-    assert re.search(r"a: simulate +\S+ +\d+ ", caplog.text)
 
 
 @pytest.mark.mpi(1)

@@ -25,12 +25,10 @@ class Fluid:
     closure : adds the force of the scales that a coarse grid or a filter removes.
 
     A state is an array of modes. If `compressible`, it holds (u, v, w, s) with s = ln(rho / rho_0), (4, kz, ky, kx);
-    otherwise it holds the velocity, (3, kz, ky, kx). `transforms` is the number of Fourier transforms in one evaluation
-    of the nonlinear terms N.
+    otherwise it holds the velocity, (3, kz, ky, kx).
     """
 
     compressible: bool
-    transforms: int
 
     def __init__(self, grid: SpectralGrid, viscosity: float, sound_speed: float = math.inf,
                  forcing: LinearForcing | None = None, closure: Closure | None = None) -> None:
@@ -45,7 +43,7 @@ class IncompressibleFluid(Fluid):
     projected as well. An evaluation of N takes nine transforms. Ranks exchange data for only eight of them.
     """
 
-    compressible, transforms = False, 9
+    compressible = False
 
     def nonlinear(self, state: np.ndarray) -> np.ndarray:
         products = self.grid.multiply(state, self._formulas.cross, 3, fields=6, expand=self._with_vorticity,
@@ -86,7 +84,7 @@ class CompressibleFluid(Fluid):
     derivatives along x and y are formed after that exchange.
     """
 
-    compressible, transforms = True, 19
+    compressible = True
 
     def nonlinear(self, state: np.ndarray) -> np.ndarray:
         tendency = self.grid.multiply(state, self._advection, 4, fields=15, expand=self._with_gradients,

@@ -36,16 +36,27 @@ def _squared(grid: SpectralGrid, velocity: np.ndarray) -> np.ndarray:
 
 
 def turbulence_scales(spectrum: np.ndarray, dissipation_rate: float, viscosity: float, cutoff: int) -> dict[str, float]:
-    """Return scales of isotropic turbulence from E(k), the dissipation rate eps and the viscosity nu.
+    """Return `derived_scales` from E(k), the dissipation rate and the viscosity.
 
-    u'^2 = 2/3 sum E(k), L = pi/(2u'^2) sum E(k)/k, T = L/u', lambda = sqrt(15 nu u'^2/eps), Re_lambda = u' lambda/nu,
-    eta = (nu^3/eps)^(1/4), t_eta = sqrt(nu/eps) (Pope 2000, chapter 6). If nu or eps is 0, viscous scales are 0 or inf.
-    `cutoff` is the largest wavenumber of the grid. The side of the box is 2 pi, so that wavenumbers are integers.
+    u'^2 = 2/3 sum E(k), L = pi/(2u'^2) sum E(k)/k (Pope 2000, chapter 6). `cutoff` is the largest wavenumber of the
+    grid. The side of the box is 2 pi, so that wavenumbers are integers.
     """
     energy = spectrum.sum()
     u_rms = np.sqrt(2 * energy / 3)
     k = np.arange(1, len(spectrum))
     integral_scale = np.pi / (2 * u_rms**2) * np.sum(spectrum[1:] / k) if energy > 0 else 0.0
+    return derived_scales(u_rms, integral_scale, dissipation_rate, viscosity, cutoff)
+
+
+def derived_scales(u_rms: float, integral_scale: float, dissipation_rate: float, viscosity: float,
+                   cutoff: int) -> dict[str, float]:
+    """Return scales of isotropic turbulence from u', the integral scale L, the dissipation rate eps and the viscosity
+    nu.
+
+    T = L/u', lambda = sqrt(15 nu u'^2/eps), Re_lambda = u' lambda/nu, eta = (nu^3/eps)^(1/4), t_eta = sqrt(nu/eps)
+    (Pope 2000, chapter 6). If nu or eps is 0, viscous scales are 0 or inf. `cutoff` is the largest wavenumber of the
+    grid.
+    """
     nu, eps = viscosity, dissipation_rate
     viscous = nu > 0 and eps > 0
     taylor_scale = np.sqrt(15 * nu * u_rms**2 / eps) if viscous else np.inf
@@ -53,7 +64,7 @@ def turbulence_scales(spectrum: np.ndarray, dissipation_rate: float, viscosity: 
     return {
         "velocity_rms": u_rms,
         "integral_scale": integral_scale,
-        "eddy_turnover_time": integral_scale / u_rms if energy > 0 else np.inf,
+        "eddy_turnover_time": integral_scale / u_rms if u_rms > 0 else np.inf,
         "taylor_scale": taylor_scale,
         "reynolds_lambda": u_rms * taylor_scale / nu if viscous else np.inf,
         "kolmogorov_length": kolmogorov_length,

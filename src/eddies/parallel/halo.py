@@ -1,5 +1,6 @@
 """Halos: copies of the particles or grid planes just outside a slab, and the adjoint of copying."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -118,14 +119,29 @@ class PlaneHalo:
 def require_thick_slabs(decomposition: SlabDecomposition, width: float) -> None:
     """Raise HaloError, which names the largest usable number of ranks, if a slab is thinner than `width`."""
     if decomposition.size > 1:
-        _require_planes(decomposition, int(np.ceil(width / decomposition.spacing - 1e-9)), f"width {width:.4g}")
+        _require_planes(decomposition, planes_within(width, decomposition.spacing), f"width {width:.4g}")
+
+
+def planes_within(width: float, spacing: float) -> int:
+    """Return the number of planes of a grid with this spacing that cover the distance `width`."""
+    return math.ceil(width / spacing - 1e-9)
+
+
+def most_slabs(planes: int, needed: int) -> int:
+    """Return the largest number of slabs of a grid, with `planes` planes in all, that have `needed` planes each."""
+    return max(planes // max(needed, 1), 1)
+
+
+def thick_slabs(planes: int, length: float, width: float) -> int:
+    """Return the largest number of slabs, at least as thick as `width`, of a cube of side `length`."""
+    return most_slabs(planes, planes_within(width, length / planes))
 
 
 def _require_planes(slab: SlabDecomposition, needed: int, purpose: str) -> None:
     thinnest = slab.planes // slab.size  # see `block_starts`
     if thinnest < needed:
         raise HaloError(f"{slab.size} ranks make slabs of {thinnest} planes, thinner than the halo of {needed} "
-                        f"planes ({purpose}); use at most {max(slab.planes // needed, 1)} ranks")
+                        f"planes ({purpose}); use at most {most_slabs(slab.planes, needed)} ranks")
 
 
 def _exchange(slab: SlabDecomposition, sent: np.ndarray, destination: int, source: int,

@@ -88,6 +88,13 @@ def resolved_wavenumber(spacing: float, filter_width: float, kolmogorov_length: 
     return min(highest, BEYOND_DISSIPATION / kolmogorov_length) if kolmogorov_length > 0 else highest
 
 
+def resolved_shells(spacing: float, filter_width: float, kolmogorov_length: float, length: float, planes: int) -> int:
+    """Return k_c in units of the smallest wavenumber, rounded down, on a grid of a cube of side `length` with so many
+    planes. The result is at least 1."""
+    highest = resolved_wavenumber(spacing, filter_width, kolmogorov_length)
+    return min(max(int(highest * length / (2 * math.pi) + 1e-9), 1), (planes - 1) // 2)
+
+
 def allowed_step(angle: float, highest: float, speed: float) -> float:
     """Return the longest time step for velocities resolved up to a wavenumber k_c = `highest`; infinite at rest.
 

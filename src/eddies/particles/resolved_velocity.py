@@ -16,11 +16,12 @@ from eddies.parallel.halo import HaloError
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.exchanges import mean_over_ranks, sum_over_ranks
-from eddies.particles.flow_units import ReferenceScales, resolved_wavenumber
+from eddies.particles.flow_units import ReferenceScales, resolved_shells
 from eddies.particles.fourier_grid import FourierGrid, Points
 from eddies.particles.least_squares import LeastSquares, Solution
 from eddies.particles.neighborhood import farthest_outside
 from eddies.particles.particle_set import ParticleSet
+from eddies.spectral.interpolation import margin_for
 from eddies.spectral.mode_operators import gaussian_transfer
 
 # Exponent of the prior's power law, the two constants of its dissipation range (Pope 2000, Eq. 6.248), and the ratio of
@@ -193,11 +194,10 @@ class ResolvedVelocity:
 
         Particles may be outside their slab by `margin` at most. The default precision is double.
         """
-        highest = resolved_wavenumber(scales.spacing, scales.filter_width, scales.kolmogorov_length)
-        shells = int(highest * decomposition.length / (2 * math.pi) + 1e-9)
-        resolved = min(max(shells, 1), (decomposition.planes - 1) // 2)
-        planes = max(math.ceil(margin / decomposition.spacing - 1e-9), 1)
-        grid = FourierGrid(decomposition, resolved, planes, dtype or torch.float64)
+        resolved = resolved_shells(scales.spacing, scales.filter_width, scales.kolmogorov_length, decomposition.length,
+                                   decomposition.planes)
+        margin_planes = margin_for(margin, decomposition.spacing)
+        grid = FourierGrid(decomposition, resolved, margin_planes, dtype or torch.float64)
         return cls(grid, scales.filter_width, scales.kolmogorov_length, weight)
 
     def of(self, particles: ParticleSet, time: float | None = None, near: Tensor | None = None) -> ResolvedFlow:

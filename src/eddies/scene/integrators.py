@@ -12,8 +12,8 @@ class Scheme:
     """A time stepping scheme that a scene can name.
 
     `nodes` and `weights` are the coefficients c and b of a Runge-Kutta scheme; other schemes have none. Each stage of a
-    Runge-Kutta scheme starts at the beginning of the step and uses only the rates of the stage before. For `angle` and
-    `iterations` see docs/closure.md.
+    Runge-Kutta scheme starts at the beginning of the step and uses only the rates of the stage before. For `angle` see
+    docs/closure.md.
     """
 
     name: str
@@ -23,19 +23,18 @@ class Scheme:
     # a component of the velocity, dt: time step.
     angle: float
     decay: float  # largest stable product of relaxation rate and time step
-    iterations: float  # typical number of iterations to solve for the resolved velocity, with about the longest step
     nodes: tuple[float, ...] = ()
     weights: tuple[float, ...] = ()
 
 
 SCHEMES = {scheme.name: scheme for scheme in (
-    Scheme(name="verlet", evaluations=1, dense=False, angle=0.5, decay=1.0, iterations=1.0),
-    Scheme(name="corrected-verlet", evaluations=2, angle=0.5, decay=2.0, iterations=1.0),
-    Scheme(name="rk2", evaluations=2, angle=1.2, decay=2.0, iterations=1.2, nodes=(0, 1 / 2), weights=(0, 1)),
+    Scheme(name="verlet", evaluations=1, dense=False, angle=0.5, decay=1.0),
+    Scheme(name="corrected-verlet", evaluations=2, angle=0.5, decay=2.0),
+    Scheme(name="rk2", evaluations=2, angle=1.2, decay=2.0, nodes=(0, 1 / 2), weights=(0, 1)),
     # Heun's scheme. Its stages are a third of a step apart. Equal distances suit the forecast from which each solve for
     # the resolved velocity starts.
-    Scheme(name="rk3", evaluations=3, angle=1.2, decay=2.51, iterations=3.0, nodes=(0, 1 / 3, 2 / 3),
+    Scheme(name="rk3", evaluations=3, angle=1.2, decay=2.51, nodes=(0, 1 / 3, 2 / 3),
            weights=(1 / 4, 0, 3 / 4)),
-    Scheme(name="rk4", evaluations=4, angle=1.6, decay=2.78, iterations=6.5, nodes=(0, 1 / 2, 1 / 2, 1),
+    Scheme(name="rk4", evaluations=4, angle=1.6, decay=2.78, nodes=(0, 1 / 2, 1 / 2, 1),
            weights=(1 / 6, 1 / 3, 1 / 3, 1 / 6)),
 )}

@@ -432,11 +432,6 @@ class Horizons(Section):
     learning_rate: float = number("learning rate at the start, for each number of frames", default=1e-3, above=0)
     energy_weight: float = number("weight of the energies in wavenumber bands in the loss", default=10.0, at_least=0)
 
-    @property
-    def scheme(self) -> Scheme:
-        """The properties of the integrator."""
-        return SCHEMES[self.integrator]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Training(Section):

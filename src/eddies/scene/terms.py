@@ -73,7 +73,6 @@ class TermSettings(Section):
     gives : its outputs, any of "acceleration", "density" (a contribution to it), "density_rate" and "shift_velocity".
     learns_through_horizons : whether only training through several steps of the simulation fits its parameters.
     viscous : whether it needs the viscosity of the fluid.
-    pair_cost : cost of a pair, relative to its cost in a plain sum over pairs; `eddies check` estimates times with it.
     damps_by : name of its parameter with damping rates by wavenumber, which a coarse grid can use; empty without one.
     too_long : text of the error for a step beyond `longest_step`; it may contain {name}, {longest} and {integrator}.
     """
@@ -83,7 +82,6 @@ class TermSettings(Section):
     gives: ClassVar[tuple[str, ...]] = ("acceleration",)
     learns_through_horizons: ClassVar[bool] = False
     viscous: ClassVar[bool] = False
-    pair_cost: ClassVar[float] = 1.0
     damps_by: ClassVar[str] = ""
     too_long: ClassVar[str] = ""
 
@@ -303,7 +301,6 @@ class FilteredEquations(TermSettings):
     """The filtered equations of motion, whose derivatives kriging estimates from neighbours."""
 
     word, viscous = "filtered-equations", True
-    pair_cost = 6.0
 
     sweeps: int = integer("iterations of the pressure among neighbours in each evaluation", default=8, at_least=1,
                           at_most=32)

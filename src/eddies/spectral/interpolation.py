@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from eddies.kernels.splines import MisplacedPoint, Splines
-from eddies.parallel.halo import HaloError, PlaneHalo
+from eddies.parallel.halo import HaloError, PlaneHalo, most_slabs, planes_within
 from eddies.spectral.spectral_grid import SpectralGrid
 
 ORDERS = {"cubic": 3, "quintic": 5}
@@ -26,9 +26,8 @@ class SplineInterpolation:
 
     def __init__(self, grid: SpectralGrid, kind: str, margin: int = 1) -> None:
         self.grid, self.degree = grid, ORDERS[kind]
-        reach = (self.degree - 1) // 2
         slab = grid.decomposition
-        self._halo = PlaneHalo(slab, reach + margin, reach + 1 + margin)
+        self._halo = PlaneHalo(slab, *ghost_planes(kind, margin))
         self._planes = range(slab.start - self._halo.below, slab.stop + self._halo.above)
         angle = 2 * np.pi / grid.cells
         transforms = [_spline_transform(self.degree, angle * axis) for axis in grid.index]
@@ -74,6 +73,22 @@ class SplineInterpolation:
         parts = self._halo.parts(np.zeros((values.shape[1], *self.grid.physical_shape), self.grid.real))
         splines.spread(values, parts)
         return self._halo.adjoint(parts)
+
+
+def ghost_planes(kind: str, margin: int) -> tuple[int, int]:
+    """Return the numbers of ghost planes below and above the slab of a rank; see `SplineInterpolation`."""
+    reach = (ORDERS[kind] - 1) // 2
+    return reach + margin, reach + 1 + margin
+
+
+def margin_for(distance: float, spacing: float) -> int:
+    """Return the `margin` for points up to `distance` outside their slab, on a grid with this spacing."""
+    return max(planes_within(distance, spacing), 1)
+
+
+def spline_ranks(planes: int, kind: str, margin: int = 1) -> int:
+    """Return the largest number of ranks for splines on a grid with so many planes."""
+    return most_slabs(planes, max(ghost_planes(kind, margin)))
 
 
 def _spline_transform(degree: int, angle: np.ndarray) -> np.ndarray:

@@ -4,24 +4,20 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
-from eddies.clock import duration
 from eddies.parallel.communicator import Comm
 from eddies.scene.scene import Scene, SceneError
-from eddies.workflows.foreseen.numbers import estimate
-from eddies.workflows.foreseen.ranks import most_ranks
-from eddies.workflows.foreseen.seconds import seconds
-from eddies.workflows.foreseen.storage import Storage, in_units, most_disk, storage
+from eddies.workflows.estimates import estimate, measure
 from eddies.workflows.problems import directory_problems, free_disk_at, memory_of_node, problems
-from eddies.workflows.variants import rollouts, steps
+from eddies.workflows.resources import in_units, most_disk, most_ranks, storage
+from eddies.workflows.variants import steps
 
 log = logging.getLogger("eddies")
 
-TURBULENCE_KEYS = ("velocity_rms", "dissipation_rate", "reynolds_lambda", "turnover_time", "kolmogorov_length",
-                   "kolmogorov_time")
-Foreseen = tuple[float | None, Storage]  # wall time of a stage, and its memory and disk space
+SCALES = ("velocity_rms", "dissipation_rate", "integral_scale", "eddy_turnover_time", "reynolds_lambda",
+          "kolmogorov_length", "kolmogorov_time", "kmax_eta")
 
 
 def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
@@ -48,64 +44,42 @@ def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
 
 def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
     """Return all estimates, with the keys that docs/check.md describes. An unknown value is None. All ranks call it."""
-    expected, tracers, k_max = estimate(scene), scene.tracers, scene.flow.largest_wavenumber
-    rollout_of = {name: estimate(each).rollout for name, each in (scene.variant or {scene.name: scene}).items()}
     planned = steps(scene, scene.stages_of_all, scene.directory)
-    refusals, warnings = problems(scene, planned, comm, memory_of_node(comm), free_disk_at(scene.directory, comm))
-    of_report, limits = directory_problems(("report",), comm, scene.directory), most_ranks(scene)
-    turbulence = expected.turbulence
+    measured, unfit = measure([scene, *(step.scene for step in planned)], comm)
+    refusals, warnings = problems(scene, planned, comm, memory_of_node(comm), free_disk_at(scene.directory, comm),
+                                  measured)
+    refusals += [*unfit, *directory_problems(("report",), comm, scene.directory)]
+    expected, limits, tracers = estimate(scene, measured), most_ranks(scene, measured), scene.tracers
     # Scenes by variant (None: shared by all variants) and stage. With realisations a stage has several scenes.
     work: dict[tuple[str | None, str], list[Scene]] = {}
     for step in sorted(planned, key=lambda step: [None, *scene.variant].index(step.variant)):
         for stage in step.stages:
             work.setdefault((step.variant, stage), []).append(step.scene)
-    pages = [each for runs in rollouts(scene, scene.directory).values() for each in runs.values()]
-    work[None, "report"] = pages or [scene]
     costs, needs = [], []
     for (variant, stage), scenes in work.items():
-        most = min(min(most_ranks(each.ground_truth_alone if stage == "dns" else each).values()) for each in scenes)
-        here, there = ([(seconds(each, stage, ranks), storage(each, stage, ranks)) for each in scenes]
-                       for ranks in (comm.size, most))
-        costs.append(row(stage, variant, here, most, there))
-        needs += [needed for _, needed in here]
+        needed = [storage(each, stage, comm.size, measured) for each in scenes]
+        kept = [each.kept for each in needed]
+        ranks = min(min(most_ranks(each.ground_truth_alone if stage == "dns" else each, measured).values())
+                    for each in scenes)
+        costs.append({"stage": stage, "variant": variant, "runs": len(scenes),
+                      "memory": max(each.memory for each in needed), "disk": None if None in kept else sum(kept),
+                      "scratch": needed[0].scratch, "most_ranks": ranks,
+                      "least_memory": max(storage(each, stage, ranks, measured).memory for each in scenes)})
+        needs += needed
+    particles = tracers and (round(expected.tracks.in_frame) if expected.tracks else tracers.particles)
     return {
         "scene": scene.name, "stages": list(scene.stages_of_all), "cells": scene.flow.cells,
-        "largest_wavenumber": k_max,
-        "turbulence": turbulence and {**{name: getattr(turbulence, name) for name in TURBULENCE_KEYS},
-                                      "kmax_eta": k_max * turbulence.kolmogorov_length},
-        "mach_turbulent": expected.mach,
-        "particles": tracers and tracers.particles, "spacing": tracers and tracers.spacing,
+        "largest_wavenumber": scene.flow.largest_wavenumber,
+        "turbulence": expected.scales and {name: expected.scales[name] for name in SCALES},
+        "mach_turbulent": expected.mach, "particles": particles, "spacing": tracers and tracers.spacing,
         "filter_width": tracers and tracers.filter_width, "kernel_support": scene.kernel_support,
         "time_step": expected.step, "limited_by": expected.step and f"[time] {expected.limited_by}",
-        "steps": expected.steps,
-        "rollouts": {name: rollout and vars(rollout) for name, rollout in rollout_of.items()},
-        "ranks": comm.size, "most_ranks": min(limits.values()), "limits": limits,
-        "most_ranks_dns": min(most_ranks(scene.ground_truth_alone).values()),
-        "stage_costs": costs,
-        "totals": {"seconds": sum(row["seconds"] or 0.0 for row in costs),
-                   "memory": max(row["memory"] for row in costs), "disk": sum(row["disk"] or 0.0 for row in costs),
+        "steps": expected.steps, "frames": expected.frames,
+        "ranks": comm.size, "most_ranks": min(limits.values()), "limits": limits, "stage_costs": costs,
+        "totals": {"memory": max(row["memory"] for row in costs), "disk": sum(row["disk"] or 0.0 for row in costs),
                    "most_disk": most_disk(needs)},
-        "warnings": warnings, "refusals": [*dict.fromkeys([*refusals, *of_report])],
+        "warnings": warnings, "refusals": [*dict.fromkeys(refusals)],
     }
-
-
-def row(stage: str, variant: str | None, here: Sequence[Foreseen], most_ranks: int,
-        there: Sequence[Foreseen]) -> dict[str, Any]:
-    """Return a row of `stage_costs`: the cost of a stage for several scenes.
-
-    `here` is the cost for each scene on the ranks of this job. `there` is the cost on `most_ranks`, the largest number
-    of ranks that the stage can use; it gives `least_seconds` and `least_memory`. Wall times and `disk` are sums over
-    the scenes; `memory`, in bytes per rank, is the largest value. The stage leaves `disk` bytes, and removes `scratch`
-    bytes at its end.
-    """
-    def total(values: Sequence[float | None]) -> float | None:
-        return None if None in values else sum(values)
-
-    return {"stage": stage, "variant": variant, "runs": 1 if stage == "report" else len(here),
-            "seconds": total([each for each, _ in here]), "memory": max(needed.memory for _, needed in here),
-            "disk": total([needed.kept for _, needed in here]), "scratch": here[0][1].scratch, "most_ranks": most_ranks,
-            "least_seconds": total([each for each, _ in there]),
-            "least_memory": max(needed.memory for _, needed in there)}
 
 
 def lines(found: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -113,21 +87,16 @@ def lines(found: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     for key, value in found.items():
         if key == "limits":
             yield from ((key, f"{ranks}: {reason}") for reason, ranks in value.items())
-        elif key == "rollouts":
-            yield from ((key, f"{name}: {as_text(rollout)}") for name, rollout in value.items())
         elif key not in ("scene", "stage_costs", "totals", "warnings", "refusals"):
             yield key, as_text(value)
     rows = {name_of(row): row for row in found["stage_costs"]} | {"total": found["totals"]}
     width = max(map(len, rows))
-    yield "costs", ("on these ranks, then on the most ranks that a stage can use; wall times are right within a factor "
-                    "of three")
-    yield "costs", f"{'stage':{width}}  {'wall time':>12}  memory a rank      disk"
+    yield "costs", f"{'stage':{width}}  memory a rank       disk  most ranks"
     for name, row in rows.items():
-        line = f"{name:{width}}  {wall_time(row['seconds']):>12}  {in_units(row['memory']):>13}  "
-        line += f"{'not known' if row['disk'] is None else in_units(row['disk']):>8}"
+        line = f"{name:{width}}  {in_units(row['memory']):>13}  "
+        line += f"{'not known' if row['disk'] is None else in_units(row['disk']):>9}"
         if "most_ranks" in row:
-            line += f"  {row['most_ranks']:>4}: {wall_time(row['least_seconds'])}"
-            line += f", {in_units(row['least_memory'])} a rank"
+            line += f"  {row['most_ranks']:>4}: {in_units(row['least_memory'])} a rank"
         yield "costs", line
     yield "costs", f"at most {in_units(found['totals']['most_disk'])} of disk at any moment"
     for problem in found["refusals"]:
@@ -147,8 +116,3 @@ def name_of(row: Mapping[str, Any]) -> str:
     """Return the name of a row of the table of stages."""
     name = f"{row['variant']}: {row['stage']}" if row["variant"] else row["stage"]
     return f"{name} ({row['runs']} times)" if row["runs"] > 1 else name
-
-
-def wall_time(seconds: float | None) -> str:
-    """Return a wall time as text."""
-    return "not known" if seconds is None else duration(seconds)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,18 +23,17 @@ from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm, node_ranks
 from eddies.parallel.reduction import global_min
-from eddies.particles.flow_units import ScaleError
+from eddies.particles.flow_units import ScaleError, allowed_step, resolved_shells
 from eddies.pipeline import STAGES
 from eddies.scene.scene import (BOX_LENGTH, Flow, Forcing, Initial, Model, Reconstruction, Scene, SceneError,
                                 Simulation, Time, Tracers, Tracks, Training)
 from eddies.scene.terms import StepUnits
-from eddies.workflows.foreseen.numbers import Estimates, Turbulence, estimate, expected_turbulence
-from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
-from eddies.workflows.foreseen.storage import Storage, in_units, most_disk, storage
+from eddies.workflows.estimates import Estimates, Measured, estimate, expected_scales
 from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.ground_truth.scene_flow import given_spectrum, stored_states
 from eddies.workflows.learned.seen import seen_by, seen_flows, start_within_training
 from eddies.workflows.learned.source import ModelDefinition, read_source
+from eddies.workflows.resources import Storage, in_units, most_disk, most_ranks, storage
 from eddies.workflows.variants import Step
 
 LARGEST_MACH = 0.3           # turbulent Mach number; the relative density fluctuations are about the square of it
@@ -59,11 +58,12 @@ def memory_of_node(comm: Comm) -> float:
 
 
 def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = math.inf,
-             free_disk: float = math.inf) -> tuple[list[str], list[str]]:
+             free_disk: float = math.inf, measured: Measured = {}) -> tuple[list[str], list[str]]:
     """Return two lists of problems of the planned steps of a scene; all ranks call it and get the same lists.
 
     `eddies run` refuses the scene if the first list is not empty. The second list holds warnings. `memory` is the
     memory of a node and `free_disk` the free disk space, both in bytes. If one is infinite, it is not checked.
+    `measured` is what `measure` has found in the files of the scene.
     """
     on_node = node_ranks(comm)
     made = {file for step in planned for file in step.files}
@@ -73,7 +73,7 @@ def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = 
     learned: dict[Path, dict[str, float]] = {}  # the flows that each model of the planned steps has seen
     for step in planned:
         own, stages = step.scene, step.stages
-        refused |= dict.fromkeys(f"{own.name}: {problem}" for problem in _infeasible(step, comm, made))
+        refused |= dict.fromkeys(f"{own.name}: {problem}" for problem in _infeasible(step, comm, made, measured))
         refused |= dict.fromkeys(directory_problems(stages, comm, step.directory))
         weights = own.model.weights_file if "train" in stages else None
         given = weights is not None and weights not in made and on_first_rank(comm, weights.is_file)
@@ -82,10 +82,10 @@ def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = 
             ModelDefinition.of(own) if given else None, own.name,
             own.device if {"train", "simulate"} & {*stages} else "cpu", comm))
         within = on_first_rank(comm, partial(_start_within_training, step, learned))
-        for doubt in (*_warnings(step, made), *within):
+        for doubt in (*_warnings(step, made, measured), *within):
             doubts.setdefault(doubt, []).append(step.variant or "")
         for stage in stages:
-            needs.append(storage(own, stage, comm.size))
+            needs.append(storage(own, stage, comm.size, measured))
             if on_node * needs[-1].memory > memory:
                 doubts[f"{stage}: {on_node} ranks with about {in_units(needs[-1].memory)} each need more than the "
                        f"{in_units(memory)} of memory here; take more nodes, or fewer cells or particles"] = []
@@ -107,37 +107,45 @@ def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = 
 # ---- problems that end a run
 
 
-def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
+def _infeasible(step: Step, comm: Comm, made: Collection[Path], measured: Measured) -> Iterator[str]:
     """Yield each reason why a step cannot work.
 
     The reasons are an unstable or decayed flow; too many steps, frames, ranks or bytes; too few frames; and ground
     truths of other runs that do not fit. `made` are the files that the planned steps write.
     """
-    scene, stages, expected = step.scene, step.stages, estimate(step.scene)
-    tracers, turbulence, directory = scene.tracers, expected.turbulence, step.links.get("dns", step.directory)
-    truth = directory / STAGES["dns"].file
+    scene, stages, expected = step.scene, step.stages, estimate(step.scene, measured)
+    tracers, scales, directory = scene.tracers, expected.scales, step.links.get("dns", step.directory)
+    truth, turnover_time = directory / STAGES["dns"].file, scales["eddy_turnover_time"] if scales else 0.0
     if "dns" in stages:
         if scene.forcing is not None:
             yield from _strong_forcing(scene.initial, scene.forcing, scene.time)
-        if tracers is not None and turbulence is not None:
-            yield from _decay(scene.flow, tracers, turbulence)
+        if tracers is not None and scales is not None:
+            yield from _decay(scene.flow, tracers, scales)
         if expected.step is not None and expected.run_time is not None:
             yield from _too_many_steps(scene.time, expected.limited_by, expected.step, expected.run_time)
-        if tracers is not None and turbulence is not None:
-            yield from _too_many_frames(tracers, tracers.turnovers * turbulence.turnover_time)
+        if tracers is not None and scales is not None:
+            yield from _too_many_frames(tracers, tracers.turnovers * turnover_time)
     if "simulate" in stages:
-        yield from _too_many_rollout_steps(scene.simulation, turbulence.turnover_time if turbulence else 0.0)
+        yield from _too_many_rollout_steps(scene.simulation, turnover_time)
     # No upper limit of the turnover time is known if the flow decays before the tracers start, or is hardly turbulent.
     decays = scene.spin_up is not None and scene.forcing is None
-    if tracers is not None and turbulence is not None and turbulence.reynolds_lambda >= TURBULENT and (
+    if tracers is not None and scales is not None and scales["reynolds_lambda"] >= TURBULENT and (
             not decays and truth in made):
-        yield from _too_few_frames(tracers, turbulence.turnover_time, partial(
+        yield from _too_few_frames(tracers, turnover_time, partial(
             check_frames, stages, tracers, scene.own_training, scene.simulation, scene.seen_in(directory)))
-    limits = most_ranks(scene.ground_truth_alone if set(stages) == {"dns"} else scene)
+    limits = most_ranks(scene.ground_truth_alone if set(stages) == {"dns"} else scene, measured)
     yield from rank_problems(limits, comm.size)
     if "train" in stages and scene.model.path is None and scene.training.truths is not None:
         from eddies.workflows.learned.truths import truth_problems  # imports torch
         yield from truth_problems(scene.training, tracers, scene.model.reads, truth, comm)
+
+
+def rank_problems(limits: Mapping[str, int], ranks: int) -> Iterator[str]:
+    """Yield a message if there are more ranks than the strictest limit allows."""
+    reason = min(limits, key=limits.__getitem__)
+    if ranks > limits[reason]:
+        yield (f"{ranks} ranks are more than the limit of {limits[reason]} ({reason}); start at most {limits[reason]}. "
+               "`eddies check` lists all limits")
 
 
 def _strong_forcing(initial: Initial, forcing: Forcing, time: Time) -> Iterator[str]:
@@ -153,12 +161,12 @@ def _strong_forcing(initial: Initial, forcing: Forcing, time: Time) -> Iterator[
                    f"unstable; raise amplitude to {least:.2g} or more, or lower injection_rate or [time] max_step")
 
 
-def _decay(flow: Flow, tracers: Tracers, turbulence: Turbulence) -> Iterator[str]:
+def _decay(flow: Flow, tracers: Tracers, scales: Mapping[str, float]) -> Iterator[str]:
     """Yield a problem if viscosity brings the flow to rest before the tracers reach their end."""
-    time = tracers.turnovers * turbulence.turnover_time
+    time = tracers.turnovers * scales["eddy_turnover_time"]
     exponent = -2 * flow.viscosity * time  # of the decay of energy at the largest scales, |k| = 1
     if exponent < LOG_NEGLIGIBLE_ENERGY and not tracers.forced:
-        yield (f"[flow] viscosity = {flow.viscosity:g}: Re_lambda would be {turbulence.reynolds_lambda:.1g}, and less "
+        yield (f"[flow] viscosity = {flow.viscosity:g}: Re_lambda would be {scales['reynolds_lambda']:.1g}, and less "
                f"than exp({exponent:.3g}) of the flow's energy would remain after [tracers] turnovers = "
                f"{tracers.turnovers:g}, a time of {time:.3g}; lower viscosity or turnovers")
 
@@ -239,15 +247,15 @@ def _unfit_files(initial: Initial | None, definition: ModelDefinition | None, na
 # ---- reasons to doubt a result
 
 
-def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
+def _warnings(step: Step, made: Collection[Path], measured: Measured) -> Iterator[str]:
     """Yield the warnings about the stages of a step. `made` are the files that the planned steps of the scene write."""
-    scene, stages, expected = step.scene, step.stages, estimate(step.scene)
+    scene, stages, expected = step.scene, step.stages, estimate(step.scene, measured)
     tracers, model, training, simulation = scene.tracers, scene.model, scene.own_training, scene.simulation
     if "dns" in stages and scene.tracks is None:
         yield from inviscid_turbulence(scene.flow, scene.initial, scene.forcing)
-        if expected.turbulence is not None:
-            yield from resolution(scene.flow, expected.turbulence)
-            yield from laminar_flow(scene.flow, expected.turbulence)
+        if expected.scales is not None:
+            yield from resolution(scene.flow, expected.scales)
+            yield from laminar_flow(scene.flow, expected.scales)
         yield from compressibility(scene.flow, expected.rms_speed)
         yield from stability(scene.flow, scene.time, expected)
         for each in tracers.all if tracers is not None else ():
@@ -258,7 +266,11 @@ def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
         yield from untrained_terms(model, training)
     if "simulate" in stages:
         if "model" in simulation.needs and not math.isinf(simulation.longest_step):
-            speed, allowed = expected.rms_speed, expected.allowed_step if scene.rollout_is_forced else None
+            speed, scales, allowed = expected.rms_speed, expected.scales, None
+            if scene.rollout_is_forced and scales is not None:
+                shells = resolved_shells(tracers.spacing, tracers.filter_width, scales["kolmogorov_length"], BOX_LENGTH,
+                                         tracers.planes)
+                allowed = allowed_step(simulation.scheme.angle, shells, scales["velocity_rms"])
             yield from rollout_steps(simulation, allowed, model, StepUnits(
                 radius=scene.interaction_radius, filter_width=tracers.filter_width, sound_speed=scene.flow.sound_speed,
                 velocity=None if speed is None else speed / math.sqrt(3), scheme=simulation.scheme))
@@ -290,20 +302,19 @@ def inviscid_turbulence(flow: Flow, initial: Initial, forcing: Forcing | None) -
     if flow.viscosity > 0 or is_path(flow.fluid) or not (forced or initial.flow.turbulent):
         return
     viscosity = (KMAX_ETA[0] / flow.largest_wavenumber) ** (4 / 3) * (
-        expected_turbulence(replace(flow, viscosity=1.0), initial, forcing).dissipation_rate ** (1 / 3))
+        expected_scales(replace(flow, viscosity=1.0), initial, forcing)["dissipation_rate"] ** (1 / 3))
     fate = ("the energy of [forcing] is never dissipated, so the flow has no stationary state" if forced else
             "no energy is dissipated, so it gathers at the smallest scales of the grid")
     yield (f"[flow] viscosity = 0: {fate}, and k_max eta, which tells whether a grid resolves the smallest scales, has "
            f"no value; raise viscosity to {at_least(viscosity)}{', or remove [forcing]' if forced else ''}")
 
 
-def resolution(flow: Flow, turbulence: Turbulence) -> Iterator[str]:
+def resolution(flow: Flow, scales: Mapping[str, float]) -> Iterator[str]:
     """Yield a warning if the grid is too coarse for the dissipation, or much finer than necessary."""
-    k_max, (least, most) = flow.largest_wavenumber, KMAX_ETA
-    reached = k_max * turbulence.kolmogorov_length
-    cells = convenient(math.ceil(3 * least / turbulence.kolmogorov_length) + 1)
+    reached, (least, most) = scales["kmax_eta"], KMAX_ETA
+    cells = convenient(math.ceil(3 * least / scales["kolmogorov_length"]) + 1)
     if reached < least * (1 - 1e-3):
-        viscosity = (least / k_max) ** (4 / 3) * turbulence.dissipation_rate ** (1 / 3)
+        viscosity = (least / flow.largest_wavenumber) ** (4 / 3) * scales["dissipation_rate"] ** (1 / 3)
         yield (f"[flow] cells = {flow.cells}: k_max eta is about {reached:.2g}, below {least:g}, so that the "
                f"dissipation is not resolved; raise cells to {cells}, or viscosity to {at_least(viscosity)}")
     elif reached > most:
@@ -329,9 +340,9 @@ def compressibility(flow: Flow, speed: float | None) -> Iterator[str]:
            f"sound_speed to {at_least(speed / LARGEST_MACH)} or more")
 
 
-def laminar_flow(flow: Flow, turbulence: Turbulence) -> Iterator[str]:
+def laminar_flow(flow: Flow, scales: Mapping[str, float]) -> Iterator[str]:
     """Yield a warning if the viscosity is too high for turbulence."""
-    reached = turbulence.reynolds_lambda
+    reached = scales["reynolds_lambda"]
     if reached < LEAST_REYNOLDS:
         why = ("the flow is laminar" if reached < 1 else f"below {LEAST_REYNOLDS:g}, and eddies decay without making "
                "smaller ones")

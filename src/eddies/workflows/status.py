@@ -16,8 +16,8 @@ from eddies.io.run_lock import job_in
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.scene import Scene, SceneError, load_scene
-from eddies.workflows.foreseen.storage import in_units
 from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, set_files, stage_fingerprint
+from eddies.workflows.resources import in_units
 from eddies.workflows.run_directory.work import differences, of_other_settings, stage_seconds
 from eddies.workflows.variants import steps
 

@@ -16,12 +16,12 @@ from eddies.parallel.reduction import global_sum
 from eddies.particles.model import FORCING
 from eddies.scene.scene import load_scene
 from eddies.workflows import dns, train
-from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
 from eddies.workflows.ground_truth.frame_counts import last_seen, rollout_start
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.learned.training_data import load_frame, model_for, training_data
 from eddies.workflows.learned.truths import open_truths, truth_problems
-from eddies.workflows.problems import problems
+from eddies.workflows.problems import problems, rank_problems
+from eddies.workflows.resources import most_ranks
 from eddies.workflows.variants import steps
 from eddies.workflows.rollout.method import forcing_of, make_method
 from tests.changed_product import changed

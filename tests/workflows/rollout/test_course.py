@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from eddies.clock import ProgressLine
 from eddies.io.frame_segments import FrameSegments
 from eddies.io.checkpoint import Guard
 from eddies.io.hdf5 import create_product, open_product
@@ -53,11 +54,14 @@ def course_of(comm, directory, looks=10**9, method=Standing, count=4, interval=0
 
 
 @pytest.mark.mpi(1)
-def test_each_part_of_a_run_has_a_warm_up_that_is_not_timed(comm, tmp_path):
+def test_each_part_of_a_run_has_a_warm_up_that_is_not_timed(comm, tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr(ProgressLine, "__call__", lambda self, done, step: shown.append(step))
     whole = course_of(comm, tmp_path / "whole")
     outcome = whole.run()
     assert outcome["status"] == "complete" and outcome["steps"] == 10 and len(whole.seconds) == 8
     assert whole.times == [0, 0.25, 0.5, 0.75, 1] and whole.stored == [0, 3, 5, 8, 10]
+    assert shown == [*range(1, 11)]  # also after steps between frames
     first = course_of(comm, tmp_path / "parts", 5)
     with pytest.raises(Stopped, match="from step 5"):
         first.run()

@@ -14,7 +14,7 @@ from torch import Tensor
 from eddies.analysis.lagrangian import evenly
 from eddies.clock import ProgressLine
 from eddies.learning.force_training import FieldLater, ForceTrainer, LossWeights, TrainingFrame
-from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow
+from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow, allowed_drift
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.integrators import INTEGRATORS
@@ -25,7 +25,6 @@ from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import SmoothingKernel
 from eddies.scene.scene import BOX_LENGTH, Training
-from eddies.workflows.foreseen.ranks import ALLOWED_VELOCITY
 from eddies.workflows.ground_truth.frame_counts import last_seen, last_trained_on, trained_frames
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import initial_model, particles_for
@@ -84,7 +83,7 @@ class TrainingData:
         """Return the trainer on windows of frames, and the window for validation; collective."""
         settings, slab = self.settings.horizons, self.truth.decomposition
         interval = self.definition.tracers.frame_interval
-        drift = ALLOWED_VELOCITY * self.model.flow.scales.velocity * interval * self.longest
+        drift = allowed_drift(self.model.flow.scales.velocity, self.longest * interval)
         dynamics = ParticleDynamics(slab, self.model, 0.0, self.dtype, fixed_ranks=True, drift=drift)
         resolution = dynamics.resolution
         if resolution is None and settings.energy_weight > 0:
