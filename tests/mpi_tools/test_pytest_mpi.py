@@ -1,44 +1,39 @@
 """The MPI plugin, on small made-up test files in a pytest of their own."""
 
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from mpi_tools.launch import local_cores
+from mpi_tools.launch import mpi_environment, mpirun_command
 
 CHECKOUT = Path(__file__).parents[2]
-HEAD = "import os, time\nimport numpy as np\nimport pytest\n\n\n"
 
 
-def run(folder, body, *options):
-    """Output and pytest's closing line for a test file with this body."""
-    (folder / "test_made_up.py").write_text(HEAD + body)
-    (folder / "pytest.ini").touch()  # a root folder of its own
-    result = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "mpi_tools.pytest_mpi", "-v", "--color=no", *options],
-        cwd=folder, env=os.environ | {"PYTHONPATH": str(CHECKOUT)}, timeout=120,
-        capture_output=True, text=True)
-    return result.stdout, result.stdout.splitlines()[-1]
+def run(folder, body, ranks=None):
+    """The exit code and the output of pytest for a test file with this body: on some ranks with -m mpi, or without."""
+    (folder / "test_made_up.py").write_text(f"import os, time\nimport pytest\n{body}")
+    line = [sys.executable, "-m", "pytest", "-p", "mpi_tools.pytest_mpi", "-c", CHECKOUT / "setup.cfg", "--rootdir",
+            folder, "-p", "no:cacheprovider", "-vv", "--color=no", folder, *(["-m", "mpi"] if ranks else [])]
+    ended = subprocess.run(mpirun_command(ranks, line) if ranks else line, cwd=folder, timeout=60,
+                           env=mpi_environment(ranks or 1) | {"PYTHONPATH": str(CHECKOUT)},
+                           stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    return ended.returncode, ended.stdout
 
 
-PASSING = """
-@pytest.mark.mpi(1, 2, 3)
-def test_sum(comm, mpi_ranks, tmp_path):
-    total = np.zeros(1)
-    comm.Allreduce(np.ones(1), total)
-    assert total[0] == comm.size == mpi_ranks
+SELECTED = """
+@pytest.mark.mpi(1, 2)
+def test_shares_a_folder(comm, tmp_path):
     (tmp_path / str(comm.rank)).touch()
     comm.Barrier()
     assert len(list(tmp_path.iterdir())) == comm.size
 
 
-@pytest.mark.mpi(2)
+@pytest.mark.mpi(1, 3)
 @pytest.mark.parametrize("letter", ["a", "b"])
-def test_two(comm, letter):
-    pass
+def test_odd(comm, letter):
+    assert comm.size != 2
 
 
 def test_unmarked():
@@ -47,123 +42,82 @@ def test_unmarked():
 """
 
 
-def test_runs_on_each_number_of_ranks_and_leaves_mpi_alone(tmp_path):
-    output, closing = run(tmp_path, PASSING, "-k", "not mpi-2-a")
-    assert " 5 passed" in closing and "failed" not in closing, output
-    assert all(f"test_sum[mpi-{ranks}] PASSED" in output for ranks in (1, 2, 3))
+@pytest.mark.parametrize("ranks, names, others", [
+    (None, ["test_unmarked"], 3), (1, ["test_shares_a_folder", "test_odd[a]", "test_odd[b]"], 1),
+    (2, ["test_shares_a_folder"], 3), (3, ["test_odd[a]", "test_odd[b]"], 2)])
+def test_the_tests_for_a_number_of_ranks_run_and_are_shown_once(tmp_path, ranks, names, others):
+    code, output = run(tmp_path, SELECTED, ranks)
+    assert code == 0 and f" {len(names)} passed, {others} deselected in " in output, output
+    assert output.count("PASSED") == len(names) and all(f"{name} PASSED" in output for name in names)
 
 
-@pytest.fixture(scope="module")
-def failing(tmp_path_factory):
-    """Output and closing line for tests that end in every way, each after another that failed."""
-    return run(tmp_path_factory.mktemp("failing"), """
-@pytest.mark.mpi(2, timeout=2)
-def test_hangs(comm):
-    if comm.rank == 1:
-        time.sleep(1000)  # here
-    comm.Barrier()
+def test_a_number_of_ranks_without_tests_is_no_failure(tmp_path):
+    code, output = run(tmp_path, "def test_unmarked():\n    pass\n", 2)
+    assert code == 0 and " 1 deselected in " in output, output
 
 
-@pytest.mark.mpi(2)
-def test_others_wait(comm):
-    print("value", 40 + comm.rank)
-    if comm.rank == 1:
-        raise ValueError("raised while rank 0 is in a barrier")
-    comm.Barrier()
-
-
-@pytest.mark.mpi(2)
-def test_leaves(comm):
-    pytest.skip("no reason")
-
-
-@pytest.mark.mpi(2)
-@pytest.mark.xfail(reason="known")
-def test_expected(comm):
-    assert comm.size == 1
-
+FAILING = """
+{}
 
 @pytest.fixture
-def broken(comm):
-    raise RuntimeError("in the fixture")
+def fixture(comm):
+    assert comm.rank != 1 or "{}" != "setup"
 
 
 @pytest.mark.mpi(2)
-def test_setup(broken):
-    pass
-
-
-@pytest.mark.mpi(2)
-def test_dies(comm):
-    if comm.rank == 1:
-        os._exit(3)
+def test_fails(comm, fixture):
+    print("value", 40 + comm.rank)
+    assert comm.rank != 1 or "{}" != "call", "rank 0 is in a barrier"
+    comm.Barrier()
     comm.Barrier()
 
 
 @pytest.mark.mpi(2)
 def test_after(comm):
-    comm.Barrier()
-
-
-def test_without_marker(comm):
     pass
-""")
-
-
-def test_the_rest_runs_after_a_failure(failing):
-    output, closing = failing
-    assert " 4 failed, 1 passed, 1 skipped, 1 xfailed, 1 error" in closing, output
-    assert "test_after[mpi-2] PASSED" in output
-    assert "needs @pytest.mark.mpi" in output
-
-
-def test_failures_on_one_rank_hanging_and_dying_ranks_are_reported(failing):
-    output, _ = failing
-    assert "rank 1 of 2 failed in call" in output
-    assert "Captured stdout of rank 1 call" in output and "value 41" in output
-    assert "ValueError: raised while rank 0 is in a barrier" in output
-    assert "failed in setup" in output and "in the fixture" in output
-    assert "rank 1 of 2 did not finish\ndid not end within the time limit of 2 s" in output
-    assert "test_made_up.py\", line 10 in test_hangs" in output
-    assert "died; output of the run" in output
-
-
-MEETING = """
-@pytest.mark.mpi(1, timeout=40)
-def test_meets(comm):
-    open("{}", "w").close()
-    while not os.path.exists("{}"):
-        time.sleep(0.01)
 """
 
 
-@pytest.mark.skipif(local_cores() < 2, reason="nothing runs beside another on one core")
-def test_runs_on_one_rank_share_the_modules_and_others_start_beside_them(tmp_path):
-    """Tests of two modules wait for each other. The rest of a module runs although a test of it died. Tests on two
-    ranks do not wait for tests without any."""
-    (tmp_path / "test_others.py").write_text(HEAD + MEETING.format("one", "two") + """
+@pytest.mark.parametrize("phase", ["collect", "setup", "call"])
+def test_a_failure_on_one_rank_is_reported_and_ends_the_job(tmp_path, phase):
+    on_import = "from mpi4py import MPI\nassert MPI.COMM_WORLD.rank == 0" if phase == "collect" else ""
+    code, output = run(tmp_path, FAILING.format(on_import, phase, phase), 2)
+    assert code != 0 and "test_after" not in output, output
+    assert "rank 1 of 2: test_made_up.py" in output and f" failed in {phase}\n" in output, output
+    assert "AssertionError" in output, output
+    if phase == "call":
+        assert "rank 0 is in a barrier" in output and "--- Captured stdout call ---\nvalue 41\n" in output, output
 
-@pytest.mark.mpi(1)
-def test_dies(comm):
-    os._exit(3)
+
+def test_a_failure_on_the_only_rank_is_as_without_mpi(tmp_path):
+    code, output = run(tmp_path, FAILING.replace("(2)", "(1)").replace("!= 1", "!= 0").format("", "", "call"), 1)
+    assert code == 1 and " 1 failed, 1 passed in " in output, output
 
 
-@pytest.mark.mpi(1)
-def test_after(comm):
-    pass
-""")
-    output, closing = run(tmp_path, MEETING.format("two", "one") + """
+def test_a_hanging_test_ends_at_its_time_limit_with_the_stacks_of_all_ranks(tmp_path):
+    code, output = run(tmp_path, """
+@pytest.mark.mpi(2, timeout=1)
+def test_hangs(comm):
+    if comm.rank == 1:
+        time.sleep(1000)
+    comm.Barrier()
+""", 2)
+    assert code != 0 and "Timeout (0:00:01)!" in output, output
+    assert all(f'test_made_up.py", line {line} in test_hangs' in output for line in (7, 8)), output
 
+
+def test_a_rank_that_leaves_ends_the_job(tmp_path):
+    code, output = run(tmp_path, """
 @pytest.mark.mpi(2)
-def test_marked(comm):
-    open(str(comm.size), "w").close()
+def test_leaves(comm):
+    if comm.rank == 1:
+        os._exit(0)
+    comm.Barrier()
+""", 2)
+    assert code != 0 and "passed" not in output, output
 
 
-@pytest.mark.parametrize("time_left", range(400, 0, -1))
-def test_unmarked(time_left):
-    if not os.path.exists("2"):
-        time.sleep(0.1)
-        assert time_left > 1
-""")
-    assert " 1 failed, 404 passed" in closing, output
-    assert "test_dies[mpi-1] FAILED" in output and "test_after[mpi-1] PASSED" in output
+@pytest.mark.parametrize("numbers", ["", "4", "1, 4"])
+def test_a_mark_without_a_number_of_ranks_that_is_tested_is_refused(tmp_path, numbers):
+    code, output = run(tmp_path, f"@pytest.mark.mpi({numbers})\ndef test_never_runs():\n    pass\n")
+    assert code == pytest.ExitCode.USAGE_ERROR and "test_never_runs: mpi(" in output, output
