@@ -30,7 +30,7 @@ COSTS = {"end": "end of the rollout (T)", "stopped_at": "became unstable at (T)"
 MOST_NAMED = 6
 LEGEND = ("Wall seconds per turnover T, with the quartiles of the time of a step as bars. Bars of errors are standard "
           "deviations over realisations, if there are several. Dashed line: Pareto front, the variants that no other "
-          "one beats in both error and time. Names: the variant of this page, bold, and the most accurate on the front. "
+          "one beats in both error and time. Names: the variant of this page, bold, and the best of the front. "
           "Crosses: variants that became unstable.")
 CAPTION = ("In the table, spectrum errors, energies and KL divergences (nats) are those at the end of the rollout, "
            "for stable variants only. T is the eddy turnover time at the release of the tracers.")
