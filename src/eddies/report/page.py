@@ -14,6 +14,10 @@ from eddies.io.new_files import write_files
 from eddies.measures import finite
 
 Number = float | int | bool | str | dict | None
+#: Keys of the sections in the order of the page, and those of the sections that are not folded.
+ORDER = ("variants", "rollout", "forced", "step", "model", "reconstruction", "kernel", "cost", "ground_truth",
+         "stationary", "tracers")
+OPEN = ("variants", "rollout", "forced")
 
 
 @dataclass(frozen=True)
@@ -103,6 +107,14 @@ class RunRecord:
     products: Sequence[Sequence[str]]
     warnings: Sequence[str] = ()
     links: Sequence[tuple[str, str]] = ()
+
+
+def arranged(sections: Sequence[Section]) -> list[Section]:
+    """Return the sections in the order of the page. Those that are not in OPEN are folded."""
+    ordered = sorted(sections, key=lambda each: ORDER.index(each.key))
+    for each in ordered:
+        each.folded = each.key not in OPEN
+    return ordered
 
 
 def shown(value: Number) -> str:

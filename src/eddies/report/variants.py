@@ -2,17 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import numpy as np
-from matplotlib import patheffects
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.text import Text
-from matplotlib.transforms import Bbox
 
 from eddies.analysis.pareto import COST, cheapest_grid, pareto_front, verdict
 from eddies.measures import DRAWN, MEASURES, SHOWN
@@ -32,11 +27,11 @@ COSTS = {"end": "end of the rollout (T)", "stopped_at": "became unstable at (T)"
          "training_steps": "training (steps)", "step_seconds": "search for the step (s)",
          "break_even_simulation": "cheaper than the direct simulation after (T)",
          "break_even_grid": "cheaper than the cheapest grid of equal or smaller error at T/2 after (T)"}
-MOST_NAMED = 20
+MOST_NAMED = 6
 LEGEND = ("Wall seconds per turnover T, with the quartiles of the time of a step as bars. Bars of errors are standard "
           "deviations over realisations, if there are several. Dashed line: Pareto front, the variants that no other "
-          f"one beats in both error and time. In a panel with more than {MOST_NAMED} variants, coarse grids off the "
-          "front have no names. Crosses at the top: variants that became unstable, at the time given.")
+          "one beats in both error and time. Names: the variant of this page, bold, and the best of the front. "
+          "Crosses: variants that became unstable.")
 CAPTION = ("In the table, spectrum errors, energies and KL divergences (nats) are those at the end of the rollout, "
            "for stable variants only. T is the eddy turnover time at the release of the tracers.")
 
@@ -138,12 +133,11 @@ def scatter(table: ErrorAgainstTime, measures: Sequence[str]) -> Figure:
     styles = [Line2D([], [], color=colour, marker=marker, linestyle="", label=kind)
               for kind, (colour, marker) in table.markers.items()]
     if table.stopped():
-        styles.append(Line2D([], [], color=DNS, marker="x", linestyle="", label="unstable, at this time"))
+        styles.append(Line2D([], [], color=DNS, marker="x", linestyle="", label="unstable"))
     styles.append(Line2D([], [], color=GUIDE, linestyle="--", label="Pareto front"))
     across = 5  # entries in a line of the legend
     figure, axes = panels(-(-len(measures) // columns), columns, (5.4, 4.2) if columns == 2 else (9.3, 6.0),
                           foot=0.15 + 0.2 * -(-len(styles) // across))
-    FigureCanvasAgg(figure)  # needed to measure the names of points
     for axis in axes.flat[len(measures):]:
         axis.remove()
     for axis, measure in zip(axes.flat, measures):
@@ -174,12 +168,12 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
     axis.plot([rows[index][COST] for index in front], [rows[index][measure] for index in front], color=GUIDE,
               linestyle="--", linewidth=1.2, zorder=1)
     axis.set(xlabel="wall seconds per turnover T", ylabel=in_symbols(MEASURES[measure]))
-    places = [(row[COST], row[measure]) for row in rows] + [(row[COST], _top(axis)) for row in stopped]
-    names = [row["label"] if len(rows) <= MOST_NAMED or not row["on_grid"] or index in front else ""
-             for index, row in enumerate(rows)]
-    names += [f"{row['label']} {row['stopped_at']:.2g} T" for row in stopped]
-    if places:
-        name_points(axis, places, names, [row["name"] == table.subject for row in [*rows, *stopped]])
+    named = [row for row in rows if row["name"] == table.subject]
+    named += [rows[index] for index in front[::-1] if rows[index] not in named][:MOST_NAMED - len(named)]
+    for number, row in enumerate(sorted(named, key=lambda row: row[COST])):
+        axis.annotate(row["label"], (row[COST], row[measure]), (7, 7 if number % 2 else -7), va="center",
+                      textcoords="offset points", fontsize=8.5, annotation_clip=False, zorder=5,
+                      fontweight="bold" if row["name"] == table.subject else "normal")
 
 
 def in_symbols(words: str) -> str:
@@ -204,31 +198,3 @@ def _top(axis: Axes) -> float:
     """Return the y value at which unstable variants are drawn: a little below the upper edge of the panel."""
     low, high = np.log10(axis.get_ylim())
     return 10 ** (high - 0.03 * (high - low))
-
-
-def name_points(axis: Axes, points: np.ndarray, names: Sequence[str], bold: Sequence[bool]) -> list[Bbox]:
-    """Write a name beside each of the points (n, 2) of a panel with fixed limits. Return the names' boxes in pixels.
-
-    A name is to the right or left of its point, at the nearest height at which it covers no other name or point. A thin
-    line connects a distant name with its point. Empty names are not written. bold: for each name, whether it is bold.
-    """
-    renderer, reach, frame = axis.figure.canvas.get_renderer(), 5 * axis.figure.dpi / 72, axis.bbox
-    taken = [Bbox([pixel - reach, pixel + reach]) for pixel in axis.transData.transform(points)]
-    heights = sorted(range(-150, 151, 3), key=abs)
-    line = {"arrowstyle": "-", "color": "#8a8a8a", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3}
-    for point, name, heavy in zip(points, names, bold):
-        if not name:
-            continue
-        text = axis.annotate(name, point, xytext=(0, 0), textcoords="offset points", va="center", fontsize=8.5,
-                             fontweight="bold" if heavy else "normal", arrowprops=line, annotation_clip=False, zorder=5,
-                             path_effects=[patheffects.withStroke(linewidth=2, foreground="white")])
-        for height, (side, alignment) in product(heights, ((1, "left"), (-1, "right"))):
-            text.set(position=(side * (8 + abs(height) / 4), height), horizontalalignment=alignment)
-            text.update_positions(renderer)
-            box = Text.get_window_extent(text)  # the annotation's own extent includes the line
-            inside = frame.x0 <= box.x0 and box.x1 <= frame.x1 and frame.y0 <= box.y0 and box.y1 <= frame.y1
-            if inside and not any(box.overlaps(other) for other in taken):
-                break
-        text.arrow_patch.set_visible(abs(height) > 9)
-        taken.append(box)
-    return taken[len(points):]

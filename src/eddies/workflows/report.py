@@ -35,9 +35,9 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
 from eddies.pipeline import MAKER_OF
 from eddies.report import (figures, forced, ground_truth, kernel, model, reconstruction, rollout, stationary, steps,
-                           tracers, verdict)
+                           tracers)
 from eddies.report import variants as table_of_variants
-from eddies.report.page import Metric, RunRecord, Section, shown, write_page
+from eddies.report.page import Metric, RunRecord, Section, arranged, shown, write_page
 from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.workflows.problems import directory_problems
 from eddies.workflows.product_warnings import doubts, not_finite, old_products
@@ -298,7 +298,7 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
         raise ProductError(f"{directory}: holds none of {', '.join(f'{kind}.h5' for kind in MAKER_OF)}; "
                            "run `eddies dns SCENE` first")
     page.warnings = [*doubts(directory, page.provenance, old), *page.not_finite]
-    page.sections = verdict.arranged([*page.sections, _cost_section(page)], bool(page.warnings))
+    page.sections = arranged([*page.sections, _cost_section(page)])
     return page
 
 
@@ -467,7 +467,7 @@ def _write_main(report: Report, page: Page, first: Sequence[Section], beside: Ma
     for section in page.sections:
         count = len(section.illustrations)
         log.info("report: %s%s", section.title, f" ({count} figure{'s' if count > 1 else ''})" if count else "")
-        if section.key in (verdict.KEY, table_of_variants.KEY):
+        if section.key == table_of_variants.KEY:
             log.info("  %s", section.text)
         for metric in section.metrics:
             if metric.key in section.main:
