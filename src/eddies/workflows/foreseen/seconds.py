@@ -30,7 +30,7 @@ TRANSFORM, CACHED, SINGLE, PAIR, TRACER, WEIGHT = 4e-9, 550, 0.65, 2.5e-8, 200, 
 CALL, MESSAGE, ROUNDS = 2.5e-4, 2e-6, 4
 START = {"dns": 0.4, "train-kernel": 0.7, "reconstruct": 1.0, "train": 1.0, "find-step": 0.5, "simulate": 0.3,
          "report": 2.3}
-FORM_PAIRS = {"average": 1, "linear": 1.5, "quadratic": 2.5, "kriging": 6}  # time of a neighbour, in units of "average"
+FORM_PAIRS = {"average": 1, "kriging": 6}  # time of a neighbour, in units of "average"
 SEARCH, CONFIRM = 2, 0.75    # turnovers that a search simulates on the first ground truth, and on each further one
 COLD, ITERATION = 25, 12     # iterations of a solve without a first guess; transforms in each iteration
 GRADIENT = 4                 # cost of an evaluation with its gradient, relative to one without
