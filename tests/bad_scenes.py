@@ -56,7 +56,7 @@ BAD_TEXTS = [
     (HEAD + "[variant.realisation-2]\n", "a run directory uses this name for something else"),
     (HEAD + "[variant.a]\nmodel.pairs.hiden = [8]\n", "[model.pairs] hiden: no such key; did you mean hidden?"),
     (HEAD + "[variant.a]\nsimulation.turnovers = 0.1\n", "[simulation] turnovers = 0.1 where the scene has 0.25"),
-    (HEAD + "[variant.a]\nkernel.form = 'linear'\n", '[kernel] form = "linear" where the scene has "kriging"'),
+    (HEAD + "[variant.a]\nkernel.form = 'average'\n", '[kernel] form = "average" where the scene has "kriging"'),
     (HEAD + "[variant.a]\ntraining.window = 0.4\n", "[training] window = 0.4 where the scene has 0.5"),
     (HEAD + "[varaint.a]\n", "[varaint]: no such section; did you mean variant?"),
     ('bas = "tiny"\n', "bas: no such key; did you mean base?"),

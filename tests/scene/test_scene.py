@@ -132,8 +132,8 @@ def test_a_preset_of_the_kernel_fills_absent_keys():
     assert (paper.normalization_weight, paper.learning_rate, paper.final_learning_rate) == (1.0, 1e-3, 1e-6)
     plain = load_scene("hit-small").kernel
     assert (plain.form, plain.positive, plain.final_learning_rate) == ("kriging", True, pytest.approx(2.5e-4))
-    with pytest.raises(SceneError, match=r'\[kernel\] form = "quadratic": its weights must be positive'):
-        load_scene("hit-small", ["kernel.positive=false", "kernel.form=quadratic"])
+    with pytest.raises(SceneError, match=r'\[kernel\] form = "kriging": its weights must be positive'):
+        load_scene("hit-small", ["kernel.positive=false", "kernel.form=kriging"])
 
 
 def test_the_seen_fraction_is_that_of_truths_for_training(tmp_path):

@@ -53,7 +53,7 @@ SETS = {"hit": ("whole-8", "whole-16", "whole-32", "filtered-8", "filtered-16", 
         "hit-256": ("whole-16", "whole-32", "filtered-16", "filtered-32")}
 # Done to the tracks of `hit` alone.
 FURTHER = [
-    *(Case(name, method) for name in ("whole-16", "filtered-32") for method in ("kriging", "quadratic", "average")),
+    *(Case(name, method) for name in ("whole-16", "filtered-32") for method in ("kriging", "average")),
     *(Case("whole-16", method, splines=True) for method in ("least-squares", "memory")),
     *(Case("whole-16", method, noise) for noise in (0.1, 0.3) for method in ("least-squares", "memory")),
     *(Case("whole-16", method, lost=True) for method in ("least-squares", "memory")),

@@ -1,4 +1,4 @@
-"""Fields from particles: sums at the points of a regular grid, and moving least squares at any points."""
+"""Fields from particles: sums at the points of a regular grid."""
 
 from __future__ import annotations
 
@@ -9,17 +9,10 @@ import numpy as np
 from eddies.kernels.library import ADDRESS, INT, NUMBER, address, library, members
 from eddies.kernels.neighbors import Box
 
-FITS = {1: "fit_linear", 2: "fit_quadratic"}
-
 
 class _Reconstruction(ctypes.Structure):
     _fields_ = (members(INT, "particles cells first_plane planes periodic_z") + members(NUMBER, "spacing support")
                 + members(ADDRESS, "position kernel columns sums"))
-
-
-class _Fit(ctypes.Structure):
-    _fields_ = (members(INT, "receivers periodic_z") + members(NUMBER, "length volume ridge")
-                + members(ADDRESS, "offsets senders receiver position value kernel result"))
 
 
 def kernel_numbers(support: float, pieces: np.ndarray, signed: bool = False) -> tuple[float, ...]:
@@ -50,23 +43,3 @@ def sums_on_grid(box: Box, cells: int, planes: range, numbers: tuple[float, ...]
                             numbers[0], *map(address, (position, kernel, columns, sums)))
     getattr(library(), f"reconstruction_sums_{columns.dtype}")(ctypes.byref(given))
     return sums
-
-
-def fitted(box: Box, degree: int, numbers: tuple[float, ...], volume: float, ridge: float, offsets: np.ndarray,
-           senders: np.ndarray, receivers: np.ndarray, positions: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Fit a vector at each receiver by moving least squares. Return (n, 4, 3): the vector, then its derivatives along
-    x, y and z.
-
-    `eddies.particles.particle_field.ParticleField.fitted` defines the fit. `numbers` is the weight W in the form that
-    `kernel_numbers` returns. `volume` is the mean volume of a particle. `offsets` (n + 1,) and `senders` (m,) list the
-    particles near each receiver; some of these particles may lie outside the support of W. `positions` and `values` of
-    the particles are (s, 3), the positions `receivers` are (n, 3).
-    """
-    kernel = np.array(numbers)
-    offsets, senders = (np.ascontiguousarray(rows, np.int64) for rows in (offsets, senders))
-    receivers, positions, values = (np.ascontiguousarray(a, np.float64) for a in (receivers, positions, values))
-    result = np.empty((len(receivers), 4, 3))
-    given = _Fit(len(receivers), box.periodic_z, box.length, volume, ridge,
-                 *map(address, (offsets, senders, receivers, positions, values, kernel, result)))
-    getattr(library(), FITS[degree])(ctypes.byref(given))
-    return result

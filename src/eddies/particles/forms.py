@@ -5,17 +5,17 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from eddies.parallel.reduction import global_sum
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.smoothing_kernels import SmoothingKernel
 
 log = logging.getLogger("eddies")
 
-DEGREES = {"linear": 1, "quadratic": 2}
-WORDS = {"average": "averages with the learned kernel", "kriging": "kriging among neighbours",
-         **{name: f"polynomials of degree {degree} fitted to neighbours" for name, degree in DEGREES.items()}}
+WORDS = {"average": "averages with the learned kernel", "kriging": "kriging among neighbours"}
 
 
 @dataclass(frozen=True)
@@ -24,17 +24,14 @@ class Form:
 
     Parameters
     ----------
-    name : "average", Eqs. 5 and 6; "linear" or "quadratic", moving least squares (`ParticleField.fitted`); or
-        "kriging", the best linear estimate for the covariance of filtered turbulence.
+    name : "average", Eqs. 5 and 6; or "kriging", the best linear estimate for the covariance of filtered turbulence.
     kernel : the learned kernel W. Only the form "average" accepts a W with negative values.
     filter_width : d of the filter that the velocities have passed.
-    mean_volume : mean volume of a particle.
     """
 
     name: str
     kernel: SmoothingKernel
     filter_width: float
-    mean_volume: float
 
     @property
     def words(self) -> str:
@@ -49,9 +46,7 @@ class Form:
         rank, from the particles of `field`; collective."""
         if self.name == "average":
             return field.averaged(self.kernel, points)
-        if self.name == "kriging":
-            return self._kriged(field, points)
-        return field.fitted(self.kernel, DEGREES[self.name], self.mean_volume, points)
+        return self._kriged(field, points)
 
     def on_grid(self, field: ParticleField) -> Tensor:
         """Reconstruct the velocity (m, 3) at this rank's grid points, z slowest, from the particles of `field`;
@@ -61,13 +56,14 @@ class Form:
         return self.at(field, field.points)[0]
 
     def _kriged(self, field: ParticleField, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Reconstruct as in `at`, by kriging. A quadratic fit replaces it at points where a neighbourhood has too many
-        particles or the equations are singular."""
+        """Reconstruct as in `at`, by kriging. The average replaces it at points that have too many neighbours or
+        singular equations."""
         velocity, gradient = field.kriged(self.filter_width, points)
         solved = velocity.isfinite().all(1) & gradient.isfinite().all(2).all(1)
         failed = torch.nonzero(~solved).squeeze(1)
-        if len(failed):
-            log.warning("kriging: %d of %d points have too many neighbours or singular equations; a quadratic fit "
-                        "replaces kriging there", len(failed), len(points))
-            velocity[failed], gradient[failed] = field.fitted(self.kernel, 2, self.mean_volume, points[failed])
+        count, total = global_sum(field.decomposition.comm, np.array([len(failed), len(points)]))
+        if count:  # on any rank: averages are collective
+            log.warning("kriging: %d of %d points have too many neighbours or singular equations; averages replace "
+                        "kriging there", count, total)
+            velocity[failed], gradient[failed] = field.averaged(self.kernel, points[failed])
         return velocity, gradient

@@ -1,4 +1,4 @@
-"""Particles at one moment as samples of a velocity field: averages, moving least squares and kriging."""
+"""Particles at one moment as samples of a velocity field: averages and kriging."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from eddies.kernels.pairs import PairSpace
-from eddies.kernels.reconstruction import fitted, kernel_numbers, sums_on_grid
+from eddies.kernels.reconstruction import kernel_numbers, sums_on_grid
 from eddies.parallel.halo import HaloExchange
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.exchanges import mean_over_ranks, with_ghosts
@@ -26,9 +26,6 @@ PAIRS_TOGETHER = 1 << 16
 # Number of pairs evaluated together in kriging, which has ten weights per pair. So many pairs belong to enough points
 # to occupy all threads.
 KRIGED_TOGETHER = 1 << 20
-# Ridge of moving least squares. Smaller values do not change the errors of a filtered field. Where particles gather
-# because no force acts on them, the ridge bounds the gradients.
-RIDGE = 1e-4
 
 
 class ParticleField:
@@ -37,8 +34,8 @@ class ParticleField:
     Along each axis the grid has as many cells as all slabs together have planes. The grid points of this rank are
     numbered with x fastest and z slowest.
 
-    Averages and fits are made of velocities relative to their mean over the particles, which is then added. So a mean
-    velocity changes no result, also with a kernel whose sums are not normalised, and costs no precision.
+    Results are made of velocities relative to their mean over the particles, which is then added. So a mean velocity
+    changes no result, also with a kernel whose sums are not normalised, and costs no precision.
 
     Parameters
     ----------
@@ -124,26 +121,6 @@ class ParticleField:
         sums = torch.from_numpy(sums_on_grid(self._box, slab.planes, range(slab.start, slab.stop), _for_library(kernel),
                                              self._position.numpy(), weighted.numpy()))
         return sums[:, 1:] * normalisation(kernel, sums[:, :1]) + self._mean
-
-    @torch.no_grad()
-    def fitted(self, kernel: SmoothingKernel, degree: int, mean_volume: float,
-               receivers: Tensor) -> tuple[Tensor, Tensor]:
-        """Estimate the velocity (k, 3) and its gradient (k, 3, 3) by moving least squares at any points x of this rank.
-
-        The result for each component A is the value and gradient at x of a polynomial p of this degree, 1 or 2, in
-        (x_j - x)/h. h is the support of the kernel W, which must not be negative. p minimises
-
-            V sum_j W(x - x_j) |p(x_j) - A_j|^2 + RIDGE (sum of the squares of all coefficients except the constant).
-
-        V is the `mean_volume` of a particle, so V sum_j W is one on average. Where neighbours are few, distant or badly
-        placed, the ridge dominates, and the result is close to the average with the weight W. It is the mean velocity
-        of the particles where no particle lies within the support.
-        """
-        neighbors = self._neighbors_of(receivers)
-        values = fitted(self._box, degree, _for_library(kernel), mean_volume, RIDGE, neighbors.offsets.numpy(),
-                        neighbors.senders.numpy(), receivers.numpy(), self._position.numpy(), self._velocity.numpy())
-        result = torch.from_numpy(values).to(self.dtype)
-        return result[:, 0] + self._mean, result[:, 1:].transpose(1, 2)
 
     @torch.no_grad()
     def kriged(self, filter_width: float, receivers: Tensor) -> tuple[Tensor, Tensor]:

@@ -20,8 +20,6 @@ ERRORS = {  # name of a reconstruction in the files: start of its keys in the re
     "learned_no_gradient": ("no_gradient_", "learned without L_g"),
     "cubic_spline": ("cubic_spline_", "cubic spline"),
     "wendland": ("wendland_", "Wendland C²"),
-    "linear": ("linear_", "linear fits with the learned kernel as weight"),
-    "quadratic": ("quadratic_", "quadratic fits with the learned kernel as weight"),
     "kriging": ("kriging_", "kriging, without a kernel"),
 }
 

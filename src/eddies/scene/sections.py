@@ -350,9 +350,9 @@ class Kernel(Section):
 
     preset: str | None = choice("a named set of values for absent keys; paper: Eqs. 6 to 11 as published",
                                 *KERNEL_PRESETS, default=None)
-    form: str | None = choice("reconstruction of fields and gradients from particles; average: with weights W; linear, "
-                              "quadratic: polynomials fitted with W as weight; kriging: the best estimate for filtered "
-                              "turbulence; absent: kriging", "average", "linear", "quadratic", "kriging", default=None)
+    form: str | None = choice("reconstruction of fields and gradients from particles; average: with weights W; "
+                              "kriging: the best estimate for filtered turbulence; absent: kriging", "average",
+                              "kriging", default=None)
     positive: bool | None = boolean("whether W = alpha exp(NN) g, of unit integral; false: W = NN g of Eq. 7, which "
                                     "may be negative, and Eq. 6 is not normalised; absent: true", default=None)
     neighbors: float = number("mean number of particles within the support", default=NEIGHBORS, at_least=8)
@@ -390,9 +390,8 @@ class Reconstruction(Section):
     """Fields from the particles of each frame, on a grid."""
 
     method: str = choice("least-squares: solenoidal modes with a prior; memory: the same, and the forecast from the "
-                         "frame before is the mean of the prior; kriging, quadratic, linear: from neighbours; average: "
-                         "with the kernel, Eqs. 5 and 6", "least-squares", "memory", "kriging", "quadratic", "linear",
-                         "average", default="least-squares")
+                         "frame before is the mean of the prior; kriging: from neighbours; average: with the kernel, "
+                         "Eqs. 5 and 6", "least-squares", "memory", "kriging", "average", default="least-squares")
     cells: int | None = integer("cells along each side of the grid; absent: those of the stored fields", default=None,
                                 at_least=8, at_most=MOST_CELLS)
     every: int = integer("interval between reconstructions, in frames", default=1, at_least=1)

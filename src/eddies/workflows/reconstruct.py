@@ -277,7 +277,7 @@ def _maker(settings: Reconstruction, tracers: Tracers, viscosity: float, kernel:
     """Return a function that makes a new method of [reconstruction]. Only estimates from neighbours use the kernel."""
     if not settings.of_neighbors:
         return lambda: solving_method(settings, solver, viscosity, transfer, weight)
-    form = Form(settings.method, kernel, tracers.filter_width, tracers.spacing**3)
+    form = Form(settings.method, kernel, tracers.filter_width)
     return lambda: NeighbourMethod(form, solver.grid)
 
 

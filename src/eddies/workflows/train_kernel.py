@@ -23,7 +23,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.particles.flow_units import ReferenceScales
-from eddies.particles.forms import DEGREES, Form
+from eddies.particles.forms import Form
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, SmoothingKernel, WendlandC2, integral
 from eddies.pipeline import STAGES
@@ -38,8 +38,6 @@ log = logging.getLogger("eddies")
 
 # The losses that are stored for each step.
 LOSSES = "loss", "velocity", "gradient", "normalization"
-# Methods of reconstruction ("forms"), besides averages, whose errors are measured with the learned kernel.
-OTHER_FORMS = *DEGREES, "kriging"
 
 
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
@@ -66,7 +64,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         kernels = {name: network.table() for name, network in networks.items()}
         kernels |= {"cubic_spline": CubicSpline(support), "wendland": WendlandC2(support)}
         tables = {"kernels": shapes(kernels, support), "history": history, **compare(kernels, unseen)}
-        tables["errors"] |= errors_of_forms(kernels["learned"], unseen, scales)
+        tables["errors"] |= errors_of_kriging(kernels["learned"], unseen, scales)
     description = {"form": networks["learned"].formula, "support": support, "neighbors": settings.neighbors,
                    "hidden": list(settings.hidden), "cutoff": settings.cutoff,
                    "mean_volume": networks["learned"].mean_volume, "reconstruction": settings.form}
@@ -79,9 +77,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
              "(with a cubic spline %.3f)",
              errors["velocity_error_learned"], errors["velocity_error_cubic_spline"],
              errors["gradient_error_learned"], errors["gradient_error_cubic_spline"])
-    if settings.form in OTHER_FORMS:
-        log.info('kernel: errors with form = "%s": velocity %.3f, gradient %.3f', settings.form,
-                 errors[f"velocity_error_{settings.form}"], errors[f"gradient_error_{settings.form}"])
+    if settings.form == "kriging":
+        log.info("kernel: errors of kriging: velocity %.3f, gradient %.3f", errors["velocity_error_kriging"],
+                 errors["gradient_error_kriging"])
 
 
 def keep_form(comm: Comm, path: Path, form: str | None, provenance: Mapping[str, Any]) -> None:
@@ -165,14 +163,13 @@ def compare(kernels: dict[str, SmoothingKernel], sample: KernelSample) -> dict[s
     return {"errors": errors, "slices": slices}
 
 
-def errors_of_forms(kernel: SmoothingKernel, sample: KernelSample, scales: ReferenceScales) -> dict[str, float]:
-    """Return the errors of the methods OTHER_FORMS on a field; empty for a kernel that may be negative. Collective."""
-    errors = {}
-    for name in OTHER_FORMS if kernel.mean_volume is None else ():
-        form = Form(name, kernel, scales.filter_width, scales.spacing**3)
-        errors[f"velocity_error_{name}"], errors[f"gradient_error_{name}"] = sample.errors_of(
-            *form.at(sample.particles, sample.particles.points))
-    return errors
+def errors_of_kriging(kernel: SmoothingKernel, sample: KernelSample, scales: ReferenceScales) -> dict[str, float]:
+    """Return the errors of kriging on a field; empty for a kernel that may be negative. Collective."""
+    if kernel.mean_volume is not None:
+        return {}
+    form = Form("kriging", kernel, scales.filter_width)
+    velocity, gradient = sample.errors_of(*form.at(sample.particles, sample.particles.points))
+    return {"velocity_error_kriging": velocity, "gradient_error_kriging": gradient}
 
 
 def _middle_plane(slab: SlabDecomposition, values: torch.Tensor) -> np.ndarray:

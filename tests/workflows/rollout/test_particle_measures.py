@@ -85,7 +85,7 @@ def test_averages_of_a_linear_flow_are_that_flow_away_from_its_jump(comm):
         def __init__(self):
             self.position, self.velocity = place, (place - LENGTH / 2) @ rotation.T
 
-    form = Form("average", CubicSpline(2.2 * SPACING), 2 * SPACING, SPACING**3)
+    form = Form("average", CubicSpline(2.2 * SPACING), 2 * SPACING)
     fields = ReconstructedFields(Rotating(), form, SlabDecomposition(comm, LENGTH, SIDE))
     particles = WithGradients(Rotating(), fields)
     assert particles.columns == ("position", "velocity", "velocity_gradient") and fields.cells == SIDE

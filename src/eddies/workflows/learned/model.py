@@ -135,4 +135,4 @@ def load_form(comm: Comm, path: str | Path, scales: ReferenceScales, device: tor
     network.load_state_dict({name: torch.from_numpy(tensor) for name, tensor in stored.weights.items()})
     with torch.no_grad():
         kernel = network.table()
-    return Form(description.get("reconstruction", "average"), kernel, scales.filter_width, scales.spacing**3)
+    return Form(description.get("reconstruction", "average"), kernel, scales.filter_width)
