@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from eddies.io import damage
-from eddies.io.damage import find_damage
+from eddies.io.damage import checked_attributes, find_damage
 from eddies.io.errors import ContentError, ProductError
 from eddies.io.fields import FieldWriter
 from eddies.io.hdf5 import (append_frame, create_product, growing_dataset, open_product, read_frame, read_table,
@@ -78,18 +78,14 @@ def test_a_file_that_is_cut_off_or_overwritten_is_damaged(comm, path):
             pass
 
 
-OF_H5MD = ("unit", "name", "version")  # texts for other programs, without checksums
-
-
 def everything(path):
-    """All values and attributes of a file, as bytes."""
+    """All values and attributes of a file, as bytes, but for texts of H5MD."""
     found = {}
     with h5py.File(path, locking=False) as file:
         names = []
         file.visit(names.append)
         for name in (".", *names):
-            found |= {(name, key): np.asarray(value).tobytes() for key, value in file[name].attrs.items()
-                      if key not in OF_H5MD}
+            found |= {(name, key): np.asarray(value).tobytes() for key, value in checked_attributes(file[name]).items()}
             if isinstance(file[name], h5py.Dataset):
                 found[name] = file[name].shape, file[name][()].tobytes()
     return found

@@ -2,8 +2,8 @@
 
 All data that this package writes have a checksum in each chunk (`fletcher32`). Files have the layout of HDF5 1.10, in
 which HDF5's own structure has checksums, too. Texts of attributes have a fixed length, because HDF5 stores those of
-variable length without a checksum. The few texts of H5MD, which only other programs read, have a variable length, as
-these programs expect.
+variable length without a checksum, and may crash when it reads damaged ones. The few texts of H5MD have a variable
+length, as other programs expect; this package does not read them.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import h5py
 from mpi4py import MPI
@@ -59,6 +60,12 @@ def find_damage(comm: MPI.Comm, path: Path) -> str | None:
     return None if place is None else f"{path}: {place if place == MISSING else f'the file is damaged: {place}'}"
 
 
+def checked_attributes(item: h5py.Group | h5py.Dataset) -> dict[str, Any]:
+    """Return the attributes of a group or dataset, without texts of variable length."""
+    return {name: item.attrs[name] for name in item.attrs
+            if (text := h5py.check_string_dtype(item.attrs.get_id(name).dtype)) is None or text.length is not None}
+
+
 def _opened(path: str | Path) -> h5py.File:
     return h5py.File(path, "r", locking=False)
 
@@ -77,7 +84,7 @@ def _first_damage(path: Path, rank: int, ranks: int) -> str | None:
             for name in (".", *names):
                 place = f"the attributes of {name}"
                 item = file[name]
-                dict(item.attrs)
+                checked_attributes(item)
                 if isinstance(item, h5py.Dataset):
                     for number, part in enumerate(item.iter_chunks() if item.chunks and item.size else [()]):
                         place = f"{name}, frame {part[0].start}" if part else name

@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from eddies.io.damage import naming_damage, open_to_read
+from eddies.io.damage import checked_attributes, naming_damage, open_to_read
 from eddies.io.errors import ProductError, file_errors, read_errors, remedy_for
 from eddies.io.new_files import HEADER_BYTES, frame_bytes, new_file, set_attributes, writes_first, writing
 from eddies.io.provenance import FORMAT, environment, has_this_format, product_ids, read_json, read_provenance
@@ -125,7 +125,7 @@ def stored_numbers(file: h5py.File) -> Iterator[tuple[str, int | None, np.ndarra
     file.visit(names.append)
     for name in names:
         item = file[name]
-        for attribute, value in item.attrs.items():
+        for attribute, value in checked_attributes(item).items():
             if np.asarray(value).dtype.kind == "f":
                 yield f"{name}, attribute {attribute}", None, np.asarray(value)
         if isinstance(item, h5py.Dataset) and item.dtype.kind == "f" and item.size:
