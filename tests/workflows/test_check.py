@@ -51,7 +51,7 @@ def test_numbers_for_programs(comm, capfd):
     assert [row["stage"] for row in stages] == found["stages"][:-1]  # without the report
     for row in stages:
         assert row["memory"] >= row["least_memory"] > 1e7 and row["disk"] > 0 and row["scratch"] >= 0
-        assert row["most_ranks"] == (16 if row["stage"] == "dns" else found["most_ranks"])
+        assert row["most_ranks"] == (21 if row["stage"] == "dns" else found["most_ranks"])
     assert totals["disk"] == pytest.approx(sum(row["disk"] for row in stages))
     assert totals["memory"] == max(row["memory"] for row in stages) and totals["most_disk"] >= totals["disk"]
 
@@ -67,7 +67,8 @@ def test_every_variant_is_reported_and_what_they_share_once(comm, capfd):
     assert ("no-force", "train") not in runs and (None, "simulate") not in runs and ("paper", "dns") not in runs
     one = json_of(load_scene("tiny"), comm, capfd)
     sizes = [next(row["disk"] for row in each["stage_costs"] if row["stage"] == "dns") for each in (found, one)]
-    assert sizes[0] == pytest.approx(3 * sizes[1])
+    # The further ground truths store other unfiltered states.
+    assert sizes[0] == pytest.approx(3 * sizes[1], rel=0.02)
 
 
 @pytest.mark.mpi(1)

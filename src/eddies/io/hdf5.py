@@ -159,7 +159,9 @@ def empty_dataset(group: h5py.Group, name: str, shape: tuple[int, ...], dtype: A
         else:
             compact = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
             compact.set_layout(h5py.h5d.COMPACT)
-            dataset = group.create_dataset(name, shape, dtype, dcpl=compact)
+            space = h5py.h5s.create_simple(shape) if shape else h5py.h5s.create(h5py.h5s.SCALAR)
+            dataset = h5py.Dataset(h5py.h5d.create(group.id, name.encode(), h5py.h5t.py_create(np.dtype(dtype)), space,
+                                                   compact))
         describe(dataset)
     return dataset
 
