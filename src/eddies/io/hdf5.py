@@ -19,7 +19,7 @@ from eddies.io.checksums import ATTRIBUTE, WORDS, open_to_read
 from eddies.io.errors import ProductError, file_errors, read_errors, remedy_for
 from eddies.io.new_files import HEADER_BYTES, frame_bytes, new_file, own_part, writing
 from eddies.io.provenance import FORMAT, environment, has_this_format, product_ids, read_json, read_provenance
-from eddies.io.quantities import conventions, describe, python_value
+from eddies.io.units import conventions
 from eddies.parallel.broadcast import on_all_ranks, on_first_rank
 from eddies.pipeline import MAKER_OF
 
@@ -28,6 +28,19 @@ FEW = 9  # a chunk holds many frames if a frame has at most this number of value
 SERIES = "particles/", "fields/"  # groups whose datasets have frames
 File = h5py.File
 Result = TypeVar("Result")
+
+
+class Table(dict[str, Any]):
+    """Columns of a table by name, with attributes of their datasets.
+
+    axes : names of the axes of the columns. A column with fewer axes has the first of them, and a column with the name
+        of an axis has only that one.
+    units : units by column.
+    """
+
+    def __init__(self, columns: Mapping[str, Any], axes: str = "row", units: Mapping[str, str] | None = None) -> None:
+        super().__init__(columns)
+        self.axes, self.units = axes, dict(units or {})
 
 
 def in_files(comm: MPI.Comm, path: Path, work: Callable[[], Result]) -> Result:
@@ -77,29 +90,41 @@ def open_product(comm: MPI.Comm, path: str | Path, kind: str | None) -> Iterator
         yield file
 
 
+def python_value(value: Any) -> Any:
+    """Return a number or text of an attribute as a Python object."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
 def read_attributes(file: h5py.Group, name: str) -> dict[str, Any]:
     """Return the attributes of a group as Python values; ProductError if there is no such group."""
     return {key: python_value(value) for key, value in find_group(file, name).attrs.items()}
 
 
 def write_table(file: h5py.Group, name: str, columns: Mapping[str, Any]) -> None:
-    """Write small arrays, equal on all ranks, as the datasets of a group; collective."""
+    """Write small arrays, equal on all ranks, as the datasets of a group; collective. Columns that are no `Table` have
+    rows and no units."""
     with writing(file, HEADER_BYTES):
         group = file.create_group(name)
-    for column, values in columns.items():
-        write_array(group, column, np.asarray(values))
+    table = columns if isinstance(columns, Table) else Table(columns)
+    for column, values in table.items():
+        values, axes = np.asarray(values), table.axes.split()
+        own = [column] if column in axes else axes[:values.ndim]
+        write_array(group, column, values, " ".join(own), table.units.get(column, ""))
 
 
-def write_array(group: h5py.Group, name: str, values: np.ndarray) -> None:
-    """Write an array, equal on all ranks, as a dataset; collective."""
+def write_array(group: h5py.Group, name: str, values: np.ndarray, axes: str = "", units: str = "") -> None:
+    """Write an array, equal on all ranks, as a dataset; collective. `axes` and `units` become its attributes."""
     with writing(group, values.nbytes + HEADER_BYTES):
-        describe(group.create_dataset(name, data=values))
+        _describe(group.create_dataset(name, data=values), axes, units)
 
 
-def read_table(file: h5py.Group, name: str) -> dict[str, np.ndarray]:
+def read_table(file: h5py.Group, name: str) -> Table:
     """Read what `write_table` wrote; ProductError if there is no such table."""
     group = find_group(file, name)
-    return {column: dataset[()] for column, dataset in group.items() if isinstance(dataset, h5py.Dataset)}
+    columns = {column: dataset for column, dataset in group.items() if isinstance(dataset, h5py.Dataset)}
+    axes = max((str(dataset.attrs.get("axes", "")) for dataset in columns.values()), key=len, default="")
+    return Table({column: dataset[()] for column, dataset in columns.items()}, axes,
+                 {column: dataset.attrs["units"] for column, dataset in columns.items() if "units" in dataset.attrs})
 
 
 def find_group(file: h5py.Group, name: str) -> h5py.Group:
@@ -130,8 +155,10 @@ def stored_numbers(file: h5py.File) -> Iterator[tuple[str, int | None, np.ndarra
                 yield name, None, item[()]
 
 
-def growing_dataset(group: h5py.Group, name: str, frame_shape: tuple[int, ...], dtype: Any) -> h5py.Dataset:
-    """Create an empty dataset (frames, *frame_shape) for `append_frame`; collective.
+def growing_dataset(group: h5py.Group, name: str, frame_shape: tuple[int, ...], dtype: Any, axes: str = "",
+                    units: str = "") -> h5py.Dataset:
+    """Create an empty dataset (frames, *frame_shape) for `append_frame`; collective. `axes` and `units` become its
+    attributes.
 
     A chunk has at most about 1 MiB. It holds part of a frame, or many frames if a frame has few values.
     """
@@ -142,7 +169,7 @@ def growing_dataset(group: h5py.Group, name: str, frame_shape: tuple[int, ...], 
     with writing(group, HEADER_BYTES):
         dataset = group.create_dataset(name, (0, *frame_shape), dtype, maxshape=(None, *frame_shape),
                                        chunks=tuple(chunk))
-        describe(dataset)
+        _describe(dataset, axes, units)
     return dataset
 
 
@@ -196,6 +223,11 @@ def read_times(dataset: h5py.Dataset) -> np.ndarray:
 def unfit(dataset: h5py.Dataset, problem: str) -> ProductError:
     """Return the error for a dataset with content that no stage writes."""
     return ProductError(f"{dataset.file.filename}: {dataset.name}, {problem}; {remedy_for(dataset.file.attrs['kind'])}")
+
+
+def _describe(dataset: h5py.Dataset, axes: str, units: str) -> None:
+    """Write the attributes `axes` and `units` of a dataset, unless they are empty; collective."""
+    dataset.attrs.update({name: words for name, words in (("axes", axes), ("units", units)) if words})
 
 
 def _open_checked(path: Path, kind: str | None) -> h5py.File:

@@ -15,9 +15,10 @@ from torch import Tensor
 
 from eddies.analysis.errors import fluctuations
 from eddies.analysis.isotropic_turbulence import dissipation_constant
+from eddies.flow.history import UNITS
 from eddies.flow.statistics import component_energies, energy_spectrum, gradient_moments, turbulence_scales
 from eddies.io.fields import FieldWriter
-from eddies.io.hdf5 import create_product, in_files, write_table
+from eddies.io.hdf5 import Table, create_product, in_files, write_table
 from eddies.io.trajectories import TrajectoryWriter
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import IdOrder, id_block, migrate
@@ -31,6 +32,7 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Flow, Model, Scene, SceneError, Simulation, Tracers
 from eddies.scene.sections import Eulerian, Initial, Reconstruction, Tracks
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
+from eddies.workflows.ground_truth.flow_run import write_spectra
 from eddies.workflows.ground_truth.track_frames import TrackFrames, count_for, read_measured
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 from eddies.workflows.track_solver import (NO_FILTER, LeastSquaresMethod, UniformMethod, best_solver, particles_on,
@@ -199,9 +201,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             reference |= measured_scales(comm, *paths, times[1])
         file.create_group("reference").attrs.update({
             **reference, "released_at": 0.0, "energy": float(spectra[0][1].sum()), **sound})
-        write_table(file, "statistics", {name: np.array([row[name] for row in rows]) for name in rows[0]})
-        table = dict(zip(("time", "energy", "filtered"), map(np.array, zip(*spectra))))
-        write_table(file, "spectra", {"wavenumber": np.arange(table["energy"].shape[1]), **table})
+        write_table(file, "statistics", Table({name: np.array([row[name] for row in rows]) for name in rows[0]},
+                                              units=UNITS))
+        write_spectra(file, "spectra", "time", dict(zip(("time", "energy", "filtered"), zip(*spectra))))
         file.create_group("tracks").attrs.update({
             **tracks.about, "complete": complete, "mean_count": tracks.mean_count, "weight": weight,
             **({} if math.isnan(error) else {"validation_error": error}), "traced": follows})
