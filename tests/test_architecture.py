@@ -37,6 +37,7 @@ LAYERS = (
 ONLY_IN = {
     "mpi4py*": ("parallel*", "io*", "cli", "api", "stored_run"),
     "h5py*": ("io*",),
+    "xarray*": ("io.datasets", "stored_run"),
     "pyfftw*": ("spectral*", "kernels.library"),
     "torch*": ("particles*", "learning*", "workflows*"),
     "matplotlib*": ("report*",),

@@ -1,11 +1,12 @@
 import os
+import pickle
+import sys
 import warnings
 
 import numpy as np
 import pytest
 
 import eddies
-from eddies.io import datasets
 from eddies.io.damage import open_to_read
 from eddies.io.fields import FieldWriter
 from eddies.io.hdf5 import create_product
@@ -38,26 +39,41 @@ def test_groups_are_datasets_that_are_read_on_access(directory):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("with_xarray", [True, False])
-def test_trajectories_fields_and_spectra(directory, monkeypatch, with_xarray):
-    if not with_xarray:
-        monkeypatch.setattr(datasets, "xarray", None)
+def test_all_groups_can_be_pickled(directory, monkeypatch):
+    """Also for a process with another working directory."""
+    monkeypatch.chdir(directory)
+    run = eddies.open_run(".")
+    stored = {name: pickle.dumps(run[name]) for name in run.groups}
+    monkeypatch.chdir("/")
+    for name, group in stored.items():
+        assert pickle.loads(group).identical(eddies.open_run(directory)[name]), name
+
+
+@pytest.mark.mpi(1)
+def test_without_xarray_an_error_names_it(directory, monkeypatch):
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    monkeypatch.delitem(sys.modules, "eddies.io.datasets", raising=False)
+    with pytest.raises(eddies.UserError, match=r"need xarray: .* the extra \[xarray\]"):
+        eddies.open_run(directory).trajectories()
+
+
+@pytest.mark.mpi(1)
+def test_trajectories_fields_and_spectra(directory):
     run = eddies.open_run(directory)
     ids, all_of_them = [7, 3], run.trajectories(of="truth")
     some = run.trajectories(ids, of="truth", unwrapped=True)
-    position, whole = (np.asarray(found["position"]) for found in (some, all_of_them))
-    assert np.array_equal(some["id"] if isinstance(some, dict) else some["particle"], ids)
+    position, whole = some["position"].values, all_of_them["position"].values
+    assert np.array_equal(some["particle"], ids) and some["position"].attrs == {"units": "L"}
     # Unwrapped positions start in the cube, differ by whole edges, and are continuous.
     assert np.array_equal(position[0], whole[0, ids])
     turns = (position - whole[:, ids]) / LENGTH
     assert np.abs(turns - np.rint(turns)).max() < 1e-6 and np.abs(np.diff(position, axis=0)).max() < LENGTH / 2
     field, first = run.field(of="model"), run.field(of="model", time=0.0)
-    assert field.shape[0] == 3 and field.ndim == 4 and not np.array_equal(field, first)
-    if with_xarray:
-        assert field.dims == ("component", "z", "y", "x")
-        assert float(field["x"][1]) == pytest.approx(LENGTH / field.sizes["x"])
+    assert field.dims == ("component", "z", "y", "x") and not np.array_equal(field, first)
+    assert float(field["x"][1]) == pytest.approx(LENGTH / field.sizes["x"])
     energy = run.spectrum("filtered")
-    assert float(np.asarray(energy).sum()) > 0 and run.spectrum("truth", time=0.0).ndim == 1
+    assert float(energy.sum()) > 0 and energy.attrs == {"units": "L^2/T^2"}
+    assert run.spectrum("truth", time=0.0).dims == ("wavenumber",)
 
 
 @pytest.mark.mpi(1)
@@ -89,7 +105,9 @@ def test_missing_parts_are_errors(directory, tmp_path):
         eddies.open_run(tmp_path / "nowhere")
     run = eddies.open_run(directory)
     last = run.trajectories().sizes["particle"] - 1
-    for ask, words in ((lambda: run["rollout/forces"], "no forces.*particles/model"),
+    for ask, words in ((lambda: run["rollout/forces"], "rollout.h5: holds no forces.*particles/model"),
+                       (lambda: run["rollout"], "rollout.h5: holds no such group.*particles/model"),
+                       (lambda: run["rollout/particles/model/velocity"], "holds no particles/model/velocity"),
                        (lambda: run["movie"], "no movie.*ground_truth, kernel, model, rollout"),
                        (lambda: run.field(of="tracers"), 'of = "tracers": .*filtered, unfiltered'),
                        (lambda: run.spectrum("truth", time=1e9), r"time = 1e\+09: must be between 0 and"),

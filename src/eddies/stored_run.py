@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,14 +15,19 @@ from eddies.pipeline import MAKER_OF
 from eddies.scene.rules import shortened
 from eddies.scene.scene import Scene, load_scene
 
+if TYPE_CHECKING:
+    import xarray
+
 TRAJECTORIES = {"tracers": "ground_truth/particles/tracers", "model": "rollout/particles/model",
                 "truth": "rollout/particles/truth"}
 FIELDS = {"filtered": "ground_truth/fields/filtered", "unfiltered": "ground_truth/fields/unfiltered",
           "final": "ground_truth/fields/final", "reconstructed": "reconstruction/fields/reconstructed",
           "model": "rollout/fields/model", "truth": "rollout/fields/truth"}
-#: Groups that are not stored, but computed from the rollout and its truth on access.
-MADE = tuple(f"rollout/{group}" for group in ("particles/truth", "gradients/model", "gradients/truth", "fields/model",
-                                              "fields/truth", "spectra_of_model", "spectra_of_truth"))
+# Groups that are not stored, but computed from the rollout and its truth on access, and the axes of their arrays.
+MADE = {"rollout/particles/truth": "time particle xyz",
+        **dict.fromkeys(("rollout/gradients/model", "rollout/gradients/truth"), "time particle i j"),
+        **dict.fromkeys(("rollout/fields/model", "rollout/fields/truth"), "time component z y x"),
+        **dict.fromkeys(("rollout/spectra_of_model", "rollout/spectra_of_truth"), "time wavenumber")}
 SPECTRA = {"flow": ("ground_truth/spectra", "energy"), "filtered": ("ground_truth/spectra", "filtered"),
            "model": ("rollout/spectra_of_model", "energy"), "truth": ("rollout/spectra_of_truth", "energy")}
 
@@ -30,8 +35,8 @@ SPECTRA = {"flow": ("ground_truth/spectra", "energy"), "filtered": ("ground_trut
 class StoredRun:
     """The content of a run directory, read on access.
 
-    Groups of arrays are xarray Datasets with coordinates and units. Their values are read when they are used. If xarray
-    is not installed, groups are dictionaries of numpy arrays. Access to something that is missing raises UserError.
+    Groups of arrays are xarray Datasets with coordinates and units, which can be pickled. The frames of a series are
+    read when they are used. Access to something that is missing raises UserError.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -56,40 +61,39 @@ class StoredRun:
                 found += [f"{product}/{group}" for group in groups_in(file)]
         return found + [name for name in MADE if name not in found and "rollout" in self.products]
 
-    def __getitem__(self, name: str) -> Any:
+    def __getitem__(self, name: str) -> xarray.Dataset:
         """Return the group of arrays with the name "PRODUCT/GROUP"."""
         from eddies.io.datasets import open_group
         product, _, group = name.partition("/")
         if product not in self.products:
             raise UserError(f"{self.path}: holds no {product}; it holds: {', '.join(self.products)}")
-        return self._made(group) if name in MADE else open_group(self.path / MAKER_OF[product].file, group)
+        return (self._made(group, MADE[name].split()) if name in MADE else
+                open_group(self.path / MAKER_OF[product].file, group))
 
-    def _made(self, group: str) -> Any:
+    def _made(self, group: str, axes: list[str]) -> xarray.Dataset:
         """Return a group that is computed from the rollout, frame by frame."""
         from mpi4py import MPI
 
-        from eddies.io.datasets import as_dataset, computed_array, known_array
+        from eddies.io.datasets import Frames, as_dataset
+        from eddies.io.units import UNITS
         from eddies.workflows.rollout.measured import open_rollout
-
-        def make(column: str, frames: Sequence[int]) -> list[np.ndarray]:
-            with open_rollout(self.path, MPI.COMM_SELF) as measured:
-                return [measured.groups[group].read(frame, column) for frame in frames]
-
         with open_rollout(self.path, MPI.COMM_SELF) as measured:
             if group not in measured.groups:
                 raise UserError(f"{self.path}: {group} needs rollout.h5 with its ground_truth.h5, and kernel.h5 for "
                                 "fields and gradients")
             times = measured.groups[group].times
             samples = {column: measured.groups[group].read(0, column) for column in measured.groups[group].columns}
-        arrays = {"time": known_array(f"{group}/time", times)}
-        size = np.arange(len(next(iter(samples.values()))))
-        if group.startswith("spectra"):
-            arrays["wavenumber"] = known_array(f"{group}/wavenumber", size)
-        elif not group.startswith("fields"):
-            arrays["id"] = known_array("particles/truth/id", size)
+        arrays = {"time": (times, "time", "T")}
+        counted = np.arange(len(next(iter(samples.values()))))
+        if axes[1] == "wavenumber":
+            arrays["wavenumber"] = counted, "wavenumber", "1/L"
+        elif axes[1] == "particle":
+            arrays["id"] = counted, "particle", ""
+        units = UNITS | {"velocity_gradient": "1/T", "energy": "L^2/T^2"}
         for column, sample in samples.items():
-            place = f"{group}/{column}" + "/value" * group.startswith("particles")
-            arrays[column] = computed_array(place, (len(times), *sample.shape), sample.dtype, partial(make, column))
+            read = partial(_measured, self.path.absolute(), group, column)
+            arrays[column] = (Frames((len(times), *sample.shape), sample.dtype, read),
+                              " ".join(axes[:1 + sample.ndim]), units.get(column, ""))
         return as_dataset(arrays, {})
 
     @cached_property
@@ -116,42 +120,36 @@ class StoredRun:
         from eddies.io.provenance import read_metrics
         return read_metrics(path)
 
-    def trajectories(self, ids: Any = None, of: str = "model", unwrapped: bool = False) -> Any:
+    def trajectories(self, ids: Any = None, of: str = "model", unwrapped: bool = False) -> xarray.Dataset:
         """Return position, velocity and other columns of all particles, or of the particles with the given `ids`.
 
         `of` is "model" or "truth" for the rollout, or "tracers" for the ground truth. If `unwrapped` is true, positions
         do not jump where a particle crosses a face of the periodic cube.
         """
         found = self[chosen(TRAJECTORIES, of)]
-        if ids is not None and not isinstance(ids, slice):
-            check_ids(np.asarray(ids), found["position"].shape[1])
-        if isinstance(found, dict):  # without xarray
-            rows = slice(None) if ids is None else np.asarray(ids)
-            found = {key: values[:, rows] if values.ndim > 1 else values[rows] if key == "id" else values
-                     for key, values in found.items()}
-        elif ids is not None:
-            found = found.sel(particle=ids)
+        try:
+            found = found if ids is None else found.sel(particle=ids)
+        except KeyError:
+            raise UserError(f"ids = {shortened(str(np.asarray(ids).tolist()))}: must be integers from 0 to "
+                            f"{found.sizes['particle'] - 1}, the particles of the run") from None
         if unwrapped:
             if "image" not in found:
                 raise UserError(f"{self.path}: its particles have no column image, because a version of eddies before "
                                 "1.0 made them; make them again")
-            position = found["position"]
-            path = np.asarray(position) + 2 * np.pi * np.asarray(found["image"])
-            if isinstance(found, dict):
-                return {**found, "position": path}
-            return found.assign(position=(position.dims, path, {**position.attrs, "description": "unwrapped"}))
+            path = found["position"] + 2 * np.pi * found["image"]
+            return found.assign(position=path.assign_attrs(found["position"].attrs))
         return found
 
-    def field(self, name: str = "velocity", time: float | None = None, of: str = "filtered") -> Any:
+    def field(self, name: str = "velocity", time: float | None = None, of: str = "filtered") -> xarray.DataArray:
         """Return a field on its grid, (component, z, y, x), at the stored time nearest to `time`, by default the last.
 
         `of` is "filtered" or "unfiltered" for the flow, "final" for the flow of a run without tracers, "reconstructed"
         for the fields of [reconstruction], or "model" or "truth" for the field that the kernel makes from the particles
-        of the rollout. With xarray, a scalar field has the axes (z, y, x).
+        of the rollout. A scalar field has the axes (z, y, x).
         """
         return at_time(self[chosen(FIELDS, of)], name, time)
 
-    def spectrum(self, of: str = "model", time: float | None = None) -> Any:
+    def spectrum(self, of: str = "model", time: float | None = None) -> xarray.DataArray:
         """Return the energy spectrum at the stored time nearest to `time`, by default the last one.
 
         `of` is "flow" for the unfiltered flow, "filtered" for the filtered flow, or "model" or "truth" for a
@@ -194,14 +192,7 @@ def chosen(table: dict[str, Any], of: str) -> Any:
     return table[of]
 
 
-def check_ids(ids: np.ndarray, count: int) -> None:
-    """Raise UserError if an id is not an integer from 0 to `count` - 1."""
-    if ids.size and (ids.dtype.kind not in "iu" or not 0 <= ids.min() <= ids.max() < count):
-        raise UserError(f"ids = {shortened(str(ids.tolist()))}: must be integers from 0 to {count - 1}, the particles "
-                        "of the run")
-
-
-def at_time(found: Any, name: str, time: float | None) -> Any:
+def at_time(found: xarray.Dataset, name: str, time: float | None) -> xarray.DataArray:
     """Return the variable `name` of a group at the stored time nearest to `time`, or at the last one if `time` is None.
 
     Raises UserError for an unknown variable, and if `time` lies before the first or after the last stored time by more
@@ -215,3 +206,13 @@ def at_time(found: Any, name: str, time: float | None) -> Any:
         raise UserError(f"time = {time:g}: must be between {times[0]:g} and {times[-1]:g}, the stored times")
     # `time` may be an xarray number, which numpy does not subtract from an array.
     return found[name][-1 if time is None else int(np.argmin(np.abs(times - float(time))))]
+
+
+def _measured(path: Path, group: str, column: str, frames: Iterable[int]) -> Iterator[np.ndarray]:
+    """Yield frames of a group that is computed from the rollout in the run directory `path`."""
+    from mpi4py import MPI
+
+    from eddies.workflows.rollout.measured import open_rollout
+    with open_rollout(path, MPI.COMM_SELF) as measured:
+        for frame in frames:
+            yield np.asarray(measured.groups[group].read(frame, column))

@@ -14,7 +14,7 @@ from eddies.io.errors import ContentError, ProductError
 from eddies.io.fields import FieldWriter
 from eddies.io.hdf5 import (append_frame, create_product, growing_dataset, open_product, read_frame, read_table,
                             write_table)
-from eddies.io.quantities import python_value
+from eddies.io.new_files import python_value
 from eddies.io.trajectories import TrajectoryWriter
 from eddies.io.weights import load_weights, save_weights
 

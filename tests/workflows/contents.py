@@ -3,7 +3,7 @@
 import h5py
 import numpy as np
 
-from eddies.io.quantities import python_value
+from eddies.io.new_files import python_value
 
 
 def numbers_in(comm, path):

@@ -7,6 +7,7 @@ from eddies.io.hdf5 import create_product, write_table
 from eddies.io.trajectories import TrajectoryWriter
 from eddies.io.weights import save_weights
 from eddies.particles.smoothing_kernels import KernelNetwork
+from eddies.workflows.ground_truth.flow_run import write_spectra
 
 LENGTH = 2 * np.pi
 TURNOVER, START = 1.2, 0.6  # when the rollout starts, after the release of the tracers
@@ -73,13 +74,13 @@ def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, statio
             reference |= {"released_at": 2.0, "filter_width": WIDTH, "spacing": LENGTH / total ** (1 / 3),
                           "acceleration_rms": 1.4, "density_mean": 1.0, "sound_speed": 20.0 if density else np.inf}
             reference |= {"density_rate_rms": 0.01} if density else {}
-            write_table(file, "spectra", decaying_spectra())
+            write_spectra(file, "spectra", "time", decaying_spectra())
         if frames:
             write_tracers(file, frames, density, total)
         if forced:
             file.create_group("forcing").attrs.update({"injection_rate": 0.5, "wavenumber": 2.0})
         energy = np.outer(wiggle, decaying_spectra()["energy"][0])
-        write_table(file, "spectra_of_statistics", {"wavenumber": np.arange(energy.shape[1]), "energy": energy})
+        write_spectra(file, "spectra_of_statistics", "row", {"energy": energy})
         if stationary:
             file.create_group("stationary").attrs.update({"start": 1.0, "end": 3.0})
         file.create_group("reference").attrs.update(reference)
@@ -109,7 +110,7 @@ def decaying_spectra():
     shape = np.exp(-0.05 * k**1.5) * np.maximum(k, 1.0) ** (-5 / 3) * (k > 0)
     energy = np.exp(-0.4 * time)[:, None] * shape
     filtered = energy * np.exp(-k**2 * WIDTH**2 / 12)
-    return {"time": time, "wavenumber": k, "energy": energy, "filtered": filtered}
+    return {"time": time, "energy": energy, "filtered": filtered}
 
 
 def write_kernel(comm, directory, seed=1):

@@ -16,6 +16,12 @@ from eddies.flow.statistics import (
 
 
 EVERY = 4  # steps between two samples
+#: Units of the columns of a history; the others are pure numbers.
+UNITS = {"time": "T", "time_step": "T", "seconds_per_step": "s", "eddy_turnover_time": "T", "kolmogorov_time": "T",
+         **dict.fromkeys(("energy", "energy_x", "energy_y", "energy_z", "total_energy"), "L^2/T^2"),
+         **dict.fromkeys(("dissipation_rate", "injection_rate"), "L^2/T^3"),
+         **dict.fromkeys(("integral_scale", "taylor_scale", "kolmogorov_length"), "L"),
+         "velocity_rms": "L/T", "density_rms": "M/L^3"}
 
 
 class FlowHistory:

@@ -1,11 +1,9 @@
-"""Groups of arrays for programs and notebooks. A group is an xarray Dataset, which reads values when they are used.
-Without xarray it is a dictionary of numpy arrays."""
+"""Groups of arrays of a run as xarray Datasets. Their frames are read when they are used."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,74 +11,85 @@ from typing import Any
 import h5py
 import numpy as np
 
-from eddies.io.damage import open_to_read
+from eddies.errors import UserError
+from eddies.io.damage import naming_damage, open_to_read
 from eddies.io.errors import ProductError
-from eddies.io.quantities import dataset_attributes, python_value
+from eddies.io.new_files import python_value
 
 try:
     import xarray
-    from xarray.backends import BackendArray
-    from xarray.core.indexing import (BasicIndexer, IndexingSupport, LazilyIndexedArray, OuterIndexer,
-                                      explicit_indexing_adapter)
-except ImportError:
-    xarray, BackendArray = None, object
+    from xarray.backends import BackendEntrypoint
+except ImportError as error:
+    raise UserError("the arrays of a run need xarray: install it, or eddies with the extra [xarray]") from error
 
-AXES = {"xyz": ["x", "y", "z"], "component": ["x", "y", "z"]}
+LABELS = {"xyz": ["x", "y", "z"], "component": ["x", "y", "z"]}
 EDGE = 2 * math.pi  # of the cube, in units of L
 
 
-@dataclass(frozen=True, eq=False)
-class Array(BackendArray):
-    """An array of which xarray reads only the parts that are used."""
+class Frames:
+    """An array whose first axis counts frames. xarray reads the frames that it uses.
 
-    shape: tuple[int, ...]
-    dtype: np.dtype
-    attrs: Mapping[str, Any]  # may hold units, axes and description
-    read: Callable[[tuple], np.ndarray]  # returns the part with these indices; () stands for the whole array
+    Parameters
+    ----------
+    shape, dtype : those of the array.
+    read : yields the frames with the given numbers. A function that can be pickled.
+    """
 
-    def __getitem__(self, key: BasicIndexer | OuterIndexer) -> np.ndarray:
-        return explicit_indexing_adapter(key, self.shape, IndexingSupport.OUTER_1VECTOR, self.read)
+    def __init__(self, shape: Sequence[int], dtype: np.dtype,
+                 read: Callable[[Iterable[int]], Iterator[np.ndarray]]) -> None:
+        self.shape, self.dtype, self.ndim, self._read = tuple(shape), dtype, len(shape), read
+
+    def reshape(self, shape: Sequence[int]) -> Frames:
+        """Return the same frames in another shape."""
+        return Frames(shape, self.dtype, self._read)
+
+    def __getitem__(self, key: tuple) -> np.ndarray:
+        """Return the part of the array that numpy returns; `key` has an entry for each axis."""
+        first, *rest = (part for part in key if part is not Ellipsis)
+        frames = np.arange(self.shape[0])[first]
+        if not frames.size:
+            return np.empty((0, *self.shape[1:]), self.dtype)[(slice(None), *rest)]
+        arrays = sum(isinstance(part, np.ndarray) for part in key)
+        if arrays < 2 and frames.ndim < 2:  # one whole frame is in memory at a time
+            parts = [frame[tuple(rest)] for frame in self._frames(np.atleast_1d(frames))]
+            return np.stack(parts) if frames.ndim else parts[0]
+        if isinstance(first, slice):  # several arrays, which numpy combines
+            return np.stack([*self._frames(frames)])[(slice(None), *rest)]
+        used, places = np.unique(frames, return_inverse=True)
+        return np.stack([*self._frames(used)])[(places.reshape(frames.shape), *rest)]
+
+    def __array_function__(self, *_: Any) -> Any:
+        """Tell xarray to keep this object, and to index it when values are used; functions of numpy do not take it."""
+        return NotImplemented
+
+    def _frames(self, numbers: np.ndarray) -> Iterator[np.ndarray]:
+        return (frame.reshape(self.shape[1:]) for frame in self._read(numbers.tolist()))
 
 
-def known_array(place: str, values: np.ndarray) -> Array:
-    """Return an array whose values are in memory. Its attributes are those of the dataset `place` in rollout.h5."""
-    return Array(values.shape, values.dtype, dataset_attributes("rollout", place), values.__getitem__)
+class AsGiven(BackendEntrypoint):
+    """An engine of `xarray.open_dataset` that opens a Dataset: xarray then keeps the values that it has read."""
+
+    def open_dataset(self, filename_or_obj: Any, *, drop_variables: Any = None) -> xarray.Dataset:
+        return filename_or_obj
 
 
-def computed_array(place: str, shape: tuple[int, ...], dtype: np.dtype,
-                   make: Callable[[Sequence[int]], Sequence[np.ndarray]]) -> Array:
-    """Return an array whose frames are computed when they are used. The first axis counts the frames, and `make`
-    returns the frames with the given indices. The attributes are those of the dataset `place` in rollout.h5."""
-    def read(part: tuple) -> np.ndarray:
-        first, *others = part or (slice(None),)
-        frames = np.arange(shape[0])[first]
-        made = [np.asarray(values[tuple(others)]) for values in make(np.atleast_1d(frames).tolist())]
-        if not frames.ndim:
-            return made[0]
-        return np.stack(made) if made else np.zeros((0, *shape[1:]), dtype)
-
-    return Array(shape, dtype, dataset_attributes("rollout", place), read)
-
-
-def open_group(path: Path, name: str) -> Any:
+def open_group(path: Path, name: str) -> xarray.Dataset:
     """Return the arrays in the group `name` of a product. A column of a trajectory appears as its dataset `value`.
 
     Raises ProductError if there is no such group or file.
     """
-    def read(array: str, part: tuple) -> np.ndarray:
-        with open_to_read(path) as file:
-            return np.asarray(file[array][part])
-
-    with open_to_read(path) as file:
-        group = file.get(name)
-        if not isinstance(group, h5py.Group):
-            raise ProductError(f"{path}: holds no {name}; it holds: {', '.join(groups_in(file))}")
-        columns = {key: item.get("value") if isinstance(item, h5py.Group) else item for key, item in group.items()}
-        arrays = {key: Array(item.shape, item.dtype, {name: python_value(value) for name, value in item.attrs.items()},
-                             partial(read, item.name))
-                  for key, item in columns.items() if isinstance(item, h5py.Dataset)}
-        attributes = {key: python_value(value) for key, value in group.attrs.items()}
-    return as_dataset(arrays, attributes)
+    with open_to_read(path) as file, naming_damage(path):
+        if name not in (names := groups_in(file)):
+            raise ProductError(f"{path}: holds no {name or 'such group'}; it holds: {', '.join(names)}")
+        arrays = {}
+        for key, item in file[name].items():
+            item = item.get("value") if isinstance(item, h5py.Group) else item
+            if isinstance(item, h5py.Dataset):
+                axes, units = (python_value(item.attrs.get(attribute, "")) for attribute in ("axes", "units"))
+                in_frames = item.ndim > 1 and axes.startswith("time")
+                arrays[key] = (Frames(item.shape, item.dtype, partial(_stored, path.absolute(), item.name))
+                               if in_frames else item[()]), axes, units
+        return as_dataset(arrays, {key: python_value(value) for key, value in file[name].attrs.items()})
 
 
 def groups_in(file: h5py.File) -> list[str]:
@@ -96,25 +105,32 @@ def groups_in(file: h5py.File) -> list[str]:
     return names
 
 
-def as_dataset(arrays: Mapping[str, Array], attributes: Mapping[str, Any]) -> Any:
-    """Return an xarray Dataset with these arrays, or a dictionary of numpy arrays if xarray is not installed. In the
-    Dataset, times, ids, wavenumbers and points are coordinates."""
-    if xarray is None:
-        return {key: array.read(()) for key, array in arrays.items()}
+def as_dataset(arrays: Mapping[str, tuple[np.ndarray | Frames, str, str]],
+               attributes: Mapping[str, Any]) -> xarray.Dataset:
+    """Return a Dataset of arrays, each with the names of its axes and its units ("" if unknown). Times, ids,
+    wavenumbers and points are coordinates."""
     variables, coordinates = {}, {}
-    for key, array in arrays.items():
-        axes = array.attrs.get("axes", "").split()
-        axes = axes if len(axes) == array.ndim else [f"{key}_{axis}" for axis in range(array.ndim)]
-        words = {name: array.attrs[name] for name in ("units", "description") if name in array.attrs}
-        if axes == [key] or (key == "id" and axes == ["particle"]):
-            coordinates[axes[0]] = (axes, array.read(()), words)
+    for key, (array, axes, units) in arrays.items():
+        names = axes.split()
+        if len(names) != array.ndim:
+            names = [f"{key}_{axis}" for axis in range(array.ndim)]
+        if "component" in names and array.shape[names.index("component")] == 1:  # a scalar
+            array = array.reshape([size for size, axis in zip(array.shape, names) if axis != "component"])
+            names.remove("component")
+        if names == [key] or (key == "id" and names == ["particle"]):
+            coordinates[names[0]] = names, array, {"units": units} if units else {}
         else:
-            variable = xarray.Variable(axes, LazilyIndexedArray(array), words)
-            scalar = "component" in axes and array.shape[axes.index("component")] == 1
-            variables[key] = variable.isel(component=0) if scalar else variable
-        for axis, size in zip(axes, array.shape):
-            if axis in AXES and size == len(AXES[axis]):
-                coordinates.setdefault(axis, ([axis], AXES[axis]))
+            variables[key] = names, array, {"units": units} if units else {}
+        for axis, size in zip(names, array.shape):
+            if axis in LABELS:
+                coordinates.setdefault(axis, ([axis], LABELS[axis]))
             elif axis in ("x", "y", "z"):
                 coordinates.setdefault(axis, ([axis], EDGE * np.arange(size) / size, {"units": "L"}))
-    return xarray.Dataset(variables, coordinates, attributes)
+    return xarray.open_dataset(xarray.Dataset(variables, coordinates, attributes), engine=AsGiven)
+
+
+def _stored(path: Path, name: str, frames: Iterable[int]) -> Iterator[np.ndarray]:
+    """Yield frames of the dataset `name` of a file."""
+    with open_to_read(path) as file, naming_damage(path):
+        for frame in frames:
+            yield file[name][frame]

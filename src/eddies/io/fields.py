@@ -7,6 +7,7 @@ import h5py
 import numpy as np
 
 from eddies.io.hdf5 import append_frame, find_group, growing_dataset, read_frame, read_times, unfit
+from eddies.io.units import UNITS, component_axis
 
 
 class FieldWriter:
@@ -23,9 +24,11 @@ class FieldWriter:
     def __init__(self, file: h5py.File, name: str, cells: int, variables: Mapping[str, int]) -> None:
         group = file.create_group(f"fields/{name}")
         group.attrs["cells"] = cells
-        self._time = growing_dataset(group, "time", (), np.float64)
-        self._variables = {variable: growing_dataset(group, variable, (components, *[cells] * 3), np.float32)
-                           for variable, components in variables.items()}
+        self._time = growing_dataset(group, "time", (), np.float64, "time", "T")
+        self._variables = {variable: growing_dataset(
+            group, variable, (components, *[cells] * 3), np.float32,
+            f"time {component_axis(variable, components, 'component')} z y x", UNITS.get(variable, ""))
+            for variable, components in variables.items()}
 
     def append(self, time: float, start_plane: int, variables: Mapping[str, np.ndarray]) -> None:
         """Add a frame. `variables` holds this rank's planes start_plane, start_plane + 1, ... of each variable,

@@ -17,9 +17,9 @@ from mpi4py import MPI
 
 from eddies.io.damage import checked_attributes, naming_damage, open_to_read
 from eddies.io.errors import ProductError, file_errors, read_errors, remedy_for
-from eddies.io.new_files import HEADER_BYTES, frame_bytes, new_file, set_attributes, writes_first, writing
+from eddies.io.new_files import HEADER_BYTES, frame_bytes, new_file, python_value, set_attributes, writes_first, writing
 from eddies.io.provenance import FORMAT, environment, has_this_format, product_ids, read_json, read_provenance
-from eddies.io.quantities import conventions, describe, python_value
+from eddies.io.units import conventions
 from eddies.parallel.broadcast import on_all_ranks, on_first_rank
 from eddies.pipeline import MAKER_OF
 
@@ -28,6 +28,19 @@ FEW = 9  # a chunk holds many frames if a frame has at most this number of value
 SERIES = "particles/", "fields/"  # groups whose datasets have frames
 File = h5py.File
 Result = TypeVar("Result")
+
+
+class Table(dict[str, Any]):
+    """Columns of a table by name, with attributes of their datasets.
+
+    axes : names of the axes of the columns. A column with fewer axes has the first of them, and a column with the name
+        of an axis has only that one.
+    units : units by column.
+    """
+
+    def __init__(self, columns: Mapping[str, Any], axes: str = "row", units: Mapping[str, str] | None = None) -> None:
+        super().__init__(columns)
+        self.axes, self.units = axes, dict(units or {})
 
 
 def in_files(comm: MPI.Comm, path: Path, work: Callable[[], Result]) -> Result:
@@ -83,16 +96,20 @@ def read_attributes(file: h5py.Group, name: str) -> dict[str, Any]:
 
 
 def write_table(file: h5py.Group, name: str, columns: Mapping[str, Any]) -> None:
-    """Write small arrays, equal on all ranks, as the datasets of a group; collective."""
+    """Write small arrays, equal on all ranks, as the datasets of a group; collective. Columns that are no `Table` have
+    rows and no units."""
     with writing(file, HEADER_BYTES):
         group = file.create_group(name)
-    for column, values in columns.items():
-        write_array(group, column, np.asarray(values))
+    table = columns if isinstance(columns, Table) else Table(columns)
+    for column, values in table.items():
+        values, axes = np.asarray(values), table.axes.split()
+        own = [column] if column in axes else axes[:values.ndim]
+        write_array(group, column, values, " ".join(own), table.units.get(column, ""))
 
 
-def write_array(group: h5py.Group, name: str, values: np.ndarray) -> None:
-    """Write an array, equal on all ranks, as a dataset; collective."""
-    dataset = empty_dataset(group, name, values.shape, values.dtype)
+def write_array(group: h5py.Group, name: str, values: np.ndarray, axes: str = "", units: str = "") -> None:
+    """Write an array, equal on all ranks, as a dataset; collective. `axes` and `units` become its attributes."""
+    dataset = empty_dataset(group, name, values.shape, values.dtype, axes, units)
     if values.ndim == 0:
         dataset[()] = values
     elif values.size:
@@ -101,10 +118,14 @@ def write_array(group: h5py.Group, name: str, values: np.ndarray) -> None:
             write_block(dataset, own, (0,) * values.ndim)
 
 
-def read_table(file: h5py.Group, name: str) -> dict[str, np.ndarray]:
+def read_table(file: h5py.Group, name: str) -> Table:
     """Read what `write_table` wrote; ProductError if there is no such table."""
     group = find_group(file, name)
-    return {column: dataset[()] for column, dataset in group.items() if isinstance(dataset, h5py.Dataset)}
+    columns = {column: dataset for column, dataset in group.items() if isinstance(dataset, h5py.Dataset)}
+    axes = max((python_value(dataset.attrs.get("axes", "")) for dataset in columns.values()), key=len, default="")
+    return Table({column: dataset[()] for column, dataset in columns.items()}, axes,
+                 {column: python_value(dataset.attrs["units"]) for column, dataset in columns.items()
+                  if "units" in dataset.attrs})
 
 
 def find_group(file: h5py.Group, name: str) -> h5py.Group:
@@ -135,8 +156,10 @@ def stored_numbers(file: h5py.File) -> Iterator[tuple[str, int | None, np.ndarra
                 yield name, None, item[()]
 
 
-def growing_dataset(group: h5py.Group, name: str, frame_shape: tuple[int, ...], dtype: Any) -> h5py.Dataset:
-    """Create an empty dataset (frames, *frame_shape) for `append_frame`; collective.
+def growing_dataset(group: h5py.Group, name: str, frame_shape: tuple[int, ...], dtype: Any, axes: str = "",
+                    units: str = "") -> h5py.Dataset:
+    """Create an empty dataset (frames, *frame_shape) for `append_frame`; collective. `axes` and `units` become its
+    attributes.
 
     A chunk holds part of a frame, or many frames if a frame has few values.
     """
@@ -145,13 +168,14 @@ def growing_dataset(group: h5py.Group, name: str, frame_shape: tuple[int, ...], 
     with writing(group, HEADER_BYTES):
         dataset = group.create_dataset(name, (0, *frame_shape), dtype, maxshape=(None, *frame_shape), fletcher32=True,
                                        chunks=(frames, *chunk_of(frame_shape, dtype)))
-        describe(dataset)
+        _describe(dataset, axes, units)
     return dataset
 
 
-def empty_dataset(group: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any) -> h5py.Dataset:
+def empty_dataset(group: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any, axes: str = "",
+                  units: str = "") -> h5py.Dataset:
     """Create a dataset whose values are written later; collective. Its chunks have checksums. A single number is
-    stored in the header of the dataset, which has a checksum."""
+    stored in the header of the dataset, which has a checksum. `axes` and `units` become its attributes."""
     size = math.prod(shape) * np.dtype(dtype).itemsize
     with writing(group, size + HEADER_BYTES * (1 + size // CHUNK_BYTES // 32)):
         if shape and size:
@@ -162,7 +186,7 @@ def empty_dataset(group: h5py.Group, name: str, shape: tuple[int, ...], dtype: A
             space = h5py.h5s.create_simple(shape) if shape else h5py.h5s.create(h5py.h5s.SCALAR)
             dataset = h5py.Dataset(h5py.h5d.create(group.id, name.encode(), h5py.h5t.py_create(np.dtype(dtype)), space,
                                                    compact))
-        describe(dataset)
+        _describe(dataset, axes, units)
     return dataset
 
 
@@ -223,6 +247,11 @@ def unfit(dataset: h5py.Dataset, problem: str) -> ProductError:
     """Return the error for a dataset with content that no stage writes."""
     kind = python_value(dataset.file.attrs["kind"])
     return ProductError(f"{dataset.file.filename}: {dataset.name}, {problem}; {remedy_for(kind)}")
+
+
+def _describe(dataset: h5py.Dataset, axes: str, units: str) -> None:
+    """Write the attributes `axes` and `units` of a dataset, unless they are empty; collective."""
+    set_attributes(dataset, {name: words for name, words in (("axes", axes), ("units", units)) if words})
 
 
 def _open_checked(path: Path, kind: str | None) -> h5py.File:

@@ -166,6 +166,13 @@ def set_attributes(item: h5py.Group | h5py.Dataset, values: Mapping[str, Any]) -
             item.attrs[name] = value
 
 
+def python_value(value: Any) -> Any:
+    """Return a number or text of an attribute as a Python object."""
+    if isinstance(value, bytes):
+        return value.decode()
+    return value.item() if isinstance(value, np.generic) else value
+
+
 def frame_bytes(dataset: h5py.Dataset) -> int:
     """Return an upper limit of the bytes by which a file grows when a chunked dataset gets one more frame."""
     if dataset.shape[0] % dataset.chunks[0]:

@@ -16,7 +16,7 @@ from mpi4py import MPI
 import eddies
 from eddies.io.damage import open_to_read
 from eddies.io.errors import ContentError, ProductError
-from eddies.io.quantities import python_value
+from eddies.io.new_files import python_value
 from eddies.kernels.library import in_use
 from eddies.pipeline import MAKER_OF
 

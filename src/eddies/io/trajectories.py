@@ -13,9 +13,10 @@ import numpy as np
 
 import eddies
 from eddies.io.hdf5 import append_frame, find_group, growing_dataset, read_frame, read_times, unfit, write_array
+from eddies.io.units import UNITS, component_axis
 
 IMAGE = "image"
-UNITS = {"position": "Angstrom", "velocity": "Angstrom ps-1"}
+MOLECULAR = {"position": "Angstrom", "box/edges": "Angstrom", "velocity": "Angstrom ps-1"}
 ROUNDING = 1e-6  # relative rounding error of positions in single precision
 
 
@@ -41,19 +42,17 @@ class TrajectoryWriter:
         self._group = file.create_group(f"particles/{name}")
         box = self._group.create_group("box")
         box.attrs.update({"edge": length, "dimension": 3, "boundary": np.array([b"periodic"] * 3)})
-        write_array(self._group, "id", np.arange(total))
-        self._step = growing_dataset(self._group, "step", (), np.int64)
-        self._time = growing_dataset(self._group, "time", (), np.float64)
+        write_array(self._group, "id", np.arange(total), "particle")
+        self._step = growing_dataset(self._group, "step", (), np.int64, "time")
+        self._time = growing_dataset(self._group, "time", (), np.float64, "time", "T")
         self._time.attrs["unit"] = "ps"
-        self._edges = self._element("box/edges", (3, 3), np.float64)
-        self._edges.attrs["unit"] = UNITS["position"]
-        self._columns = {column: self._element(column, (total, *shape), dtype)
-                         for column, shape in columns.items()}
+        self._edges = self._element("box/edges", (3, 3), np.float64, "time i j", UNITS["position"])
+        self._columns = {column: self._column(column, total, shape, dtype) for column, shape in columns.items()}
         self._length, self._images = length, images
         self._before: np.ndarray | None = None
         self._image: np.ndarray | int = 0
         if images:
-            self._columns[IMAGE] = self._element(IMAGE, (total, 3), np.int16)
+            self._columns[IMAGE] = self._column(IMAGE, total, (3,), np.int16)
 
     def append(self, step: int, time: float, start: int, columns: Mapping[str, np.ndarray]) -> None:
         """Add a frame. `columns` holds this rank's rows start, start + 1, ... of every column by name, or no row."""
@@ -65,13 +64,18 @@ class TrajectoryWriter:
         for column, dataset in self._columns.items():
             append_frame(dataset, columns[column], (start,) + (0,) * (dataset.ndim - 2))
 
-    def _element(self, column: str, frame_shape: tuple[int, ...], dtype: str | np.dtype) -> h5py.Dataset:
+    def _column(self, column: str, total: int, shape: tuple[int, ...], dtype: str | np.dtype) -> h5py.Dataset:
+        axes = ["time", "particle", *(component_axis(column, size, "xyz") for size in shape)]
+        return self._element(column, (total, *shape), dtype, " ".join(axes), UNITS.get(column, ""))
+
+    def _element(self, column: str, frame_shape: tuple[int, ...], dtype: str | np.dtype, axes: str,
+                 units: str) -> h5py.Dataset:
         element = self._group.create_group(column)
         # Hard links: all columns share the steps and times.
         element["step"], element["time"] = self._step, self._time
-        values = growing_dataset(element, "value", frame_shape, dtype)
-        if column in UNITS:
-            values.attrs["unit"] = UNITS[column]
+        values = growing_dataset(element, "value", frame_shape, dtype, axes, units)
+        if column in MOLECULAR:
+            values.attrs["unit"] = MOLECULAR[column]
         return values
 
     def _count_images(self, position: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from eddies.io.hdf5 import ProductError, create_product, in_files, open_product, read_table, write_table
+from eddies.io.hdf5 import ProductError, Table, create_product, in_files, open_product, read_table, write_table
 from eddies.io.new_files import set_attributes
 from eddies.io.provenance import read_json, read_provenance
 
@@ -22,7 +22,7 @@ class StoredWeights:
     path: Path
     description: dict[str, Any]
     weights: dict[str, np.ndarray]
-    tables: dict[str, dict[str, np.ndarray]]
+    tables: dict[str, Table]
     provenance: dict[str, Any]
 
 
@@ -40,7 +40,7 @@ def save_weights(comm: MPI.Comm, path: str | Path, kind: str, description: Mappi
                 raise ProductError(f"{path}: tensor {name} is not finite, so nothing is written; lower learning_rate")
         with create_product(MPI.COMM_SELF, path, kind, {"ranks": comm.size, **provenance}) as file:
             set_attributes(file, {"description": json.dumps(dict(description))})
-            write_table(file, "weights", tensors)
+            write_table(file, "weights", Table(tensors, ""))
             for name, columns in (tables or {}).items():
                 write_table(file, name, columns)
 

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from eddies.clock import ROUND_OFF, Clock, ProgressLine
-from eddies.flow.history import FlowHistory
+from eddies.flow.history import UNITS, FlowHistory
 from eddies.io.checkpoint import Checkpoint, Guard
 from eddies.io.fields import FieldWriter
 from eddies.io.frame_segments import FrameSegments
-from eddies.io.hdf5 import File, ProductError, create_product, in_files, open_product, write_table
+from eddies.io.hdf5 import File, ProductError, Table, create_product, in_files, open_product, write_table
 from eddies.io.new_files import set_attributes, write_files
 from eddies.io.provenance import product_fingerprint, product_provenance
 from eddies.io.run_lock import lock_directory
@@ -28,7 +28,7 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene, SceneError
 from eddies.scene.sections import Forcing, SpinUp, Time
 from eddies.time_stepping import STEPPERS
-from eddies.workflows.ground_truth.flow_run import FlowRun, TracerRun, frame_layout, series_of
+from eddies.workflows.ground_truth.flow_run import FlowRun, TracerRun, frame_layout, series_of, write_spectra
 from eddies.workflows.ground_truth.frame_counts import unfiltered_frames
 from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
 from eddies.workflows.problems import check_span
@@ -169,9 +169,8 @@ def write_flow(file: File, flow: FlowRun, scales: Mapping[str, float], spin_up: 
     """Write the scales and the statistics of a flow; collective."""
     set_attributes(file.create_group("reference"), {
         **scales, "viscosity": flow.fluid.viscosity, "energy_budget_error": flow.history.budget_error})
-    write_table(file, "statistics", flow.history.columns())
-    energy = np.array(flow.history.spectra)
-    write_table(file, "spectra_of_statistics", {"wavenumber": np.arange(energy.shape[1]), "energy": energy})
+    write_table(file, "statistics", Table(flow.history.columns(), units=UNITS))
+    write_spectra(file, "spectra_of_statistics", "row", {"energy": flow.history.spectra})
     if spin_up is not None and spin_up.stationary is not None:
         set_attributes(file.create_group("stationary"), stationary_span(spin_up, flow.history))
 

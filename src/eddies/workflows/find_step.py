@@ -31,7 +31,7 @@ import torch
 
 from eddies.clock import ROUND_OFF
 from eddies.import_path import is_path
-from eddies.io.hdf5 import create_product, write_table
+from eddies.io.hdf5 import Table, create_product, write_table
 from eddies.io.new_files import set_attributes
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import IdOrder
@@ -246,7 +246,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             "tolerance": half.tolerance, "seconds": seconds, "confirmed_on": len(truths) - 1,
             "turnovers": span / stretches[0].turnover})
         for name, table in tables.items():
-            write_table(file, f"trials/{name}", table)
+            write_table(file, f"trials/{name}", Table(table, units={
+                "seconds_per_turnover": "s", **({} if settings.on_grid else {"size": "T"})}))
     log.info("find-step: found %s with %s %.4g, %.3g s per turnover. With half the value the final velocity "
              "differs by %.4f of its rms, and the error is %.4f", found.step.integrator,
              "Courant number" if settings.on_grid else "step", found.step.size, found.seconds, difference, half.error)

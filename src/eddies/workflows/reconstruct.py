@@ -17,7 +17,7 @@ from torch import Tensor
 from eddies.clock import ProgressLine
 from eddies.io.checkpoint import Checkpoint, Guard
 from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments, TrajectoryLayout
-from eddies.io.hdf5 import File, create_product, open_product, read_attributes, write_table
+from eddies.io.hdf5 import File, Table, create_product, open_product, read_attributes, write_table
 from eddies.io.new_files import set_attributes
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
@@ -261,7 +261,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 tables = {"errors_over_time": whole.errors, "errors_of_fields": whole.of_fields}
                 for name, table in tables.items():
                     if table:
-                        write_table(product, name, {key: np.array([row[key] for row in table]) for key in table[0]})
+                        write_table(product, name, Table({key: np.array([row[key] for row in table])
+                                                          for key in table[0]}, "time", {"time": "T", "seconds": "s"}))
                 set_attributes(product.create_group("about"), {
                     "method": settings.method, "particles": (BOX_LENGTH / source.spacing) ** 3, "weight": weight,
                     "length_unit": source.unit, "corner": source.corner, "holdout": holdout,

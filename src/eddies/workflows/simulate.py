@@ -11,7 +11,7 @@ import torch
 from eddies.clock import pace_in_words
 from eddies.io.frame_segments import FrameSegments
 from eddies.io.checkpoint import Guard
-from eddies.io.hdf5 import create_product, write_table
+from eddies.io.hdf5 import Table, create_product, write_table
 from eddies.io.new_files import set_attributes
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
@@ -64,7 +64,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                     "eddy_turnover_time": turnover, "start_time": float(truth.times[start]),
                     "particles": truth.total, "ranks": comm.size})
                 for name, columns in method.series().items():
-                    write_table(file, name, {"time": course.times, **columns})
+                    write_table(file, name, Table({"time": course.times, **columns}, "time", {"time": "T"}))
     guard.checkpoints.remove()
     pace = (pace_in_words(outcome["seconds_per_step"], outcome["storing_share"]) if "seconds_per_step" in outcome
             else "too few steps to time")

@@ -16,9 +16,10 @@ from torch import Tensor
 
 from eddies.analysis.errors import fluctuations
 from eddies.analysis.isotropic_turbulence import dissipation_constant
+from eddies.flow.history import UNITS
 from eddies.flow.statistics import component_energies, energy_spectrum, gradient_moments, turbulence_scales
 from eddies.io.fields import FieldWriter
-from eddies.io.hdf5 import File, create_product, in_files, write_table
+from eddies.io.hdf5 import File, Table, create_product, in_files, write_table
 from eddies.io.new_files import set_attributes
 from eddies.io.trajectories import TrajectoryWriter
 from eddies.parallel.communicator import Comm
@@ -33,6 +34,7 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Flow, Model, Scene, SceneError, Simulation, Tracers
 from eddies.scene.sections import Eulerian, Initial, Reconstruction, Tracks
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
+from eddies.workflows.ground_truth.flow_run import write_spectra
 from eddies.workflows.ground_truth.track_frames import TrackFrames, count_for, read_measured
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 from eddies.workflows.track_solver import (NO_FILTER, LeastSquaresMethod, UniformMethod, best_solver, particles_on,
@@ -150,8 +152,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         if scene.flow.compressible:
             sound["mach_turbulent"] = math.sqrt(2 * energy) / scene.flow.sound_speed
         set_attributes(file.create_group("reference"), {**reference, "released_at": 0.0, "energy": energy, **sound})
-        write_table(file, "statistics", {name: np.array([row[name] for row in rows]) for name in rows[0]})
-        write_table(file, "spectra", {"wavenumber": np.arange(spectra["energy"].shape[1]), **spectra})
+        write_table(file, "statistics", Table({name: np.array([row[name] for row in rows]) for name in rows[0]},
+                                              units=UNITS))
+        write_spectra(file, "spectra", "time", spectra)
         set_attributes(file.create_group("tracks"), {
             **tracks.about, "complete": tracks.complete, "mean_count": tracks.mean_count, "weight": flows.weight,
             **({} if math.isnan(flows.error) else {"validation_error": flows.error}), "traced": follows})

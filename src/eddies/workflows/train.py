@@ -14,9 +14,10 @@ from typing import Any
 import torch
 
 from eddies.io.checkpoint import Guard
+from eddies.io.hdf5 import Table
+from eddies.io.new_files import write_files
 from eddies.io.provenance import product_provenance
 from eddies.io.weights import StoredWeights, save_weights
-from eddies.io.new_files import write_files
 from eddies.learning.training import Training
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
@@ -76,11 +77,11 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             training, curves = Training(comm, model, phases), LearningCurves(comm, directory / "learning.png")
             take_all_steps(training, guard, "train", "training", "lower learning_rate here or in [training.horizons], "
                            "or shorten time_step there", curves)
-            history, cost = {"history": training.columns()}, training.cost
+            history, cost = {"history": Table(training.columns(), units={"seconds": "s"})}, training.cost
         tested = model_for(definition, truth, dtype, model) if own is None else own
         tables = history | evaluate(truth, tested, last, dtype)
         if model.networks:
-            tables["feature_range"] = vars(feature_range(data))
+            tables["feature_range"] = Table(vars(feature_range(data)), "input")
         description = definition.describe(truth.scales) | {"training": cost,
                                                            "coefficients": tested.learned_coefficients}
         of_named = {str(path): truth.reference.get("mach_turbulent")

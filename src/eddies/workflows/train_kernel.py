@@ -13,6 +13,7 @@ from torch import nn
 
 from eddies.analysis.lagrangian import evenly
 from eddies.io.checkpoint import Guard
+from eddies.io.hdf5 import Table
 from eddies.io.weights import load_weights, save_weights
 from eddies.learning.kernel_training import KernelSample, KernelTrainer
 from eddies.learning.training import Phase, Training
@@ -63,8 +64,10 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     with torch.no_grad():
         kernels = {name: network.table() for name, network in networks.items()}
         kernels |= {"cubic_spline": CubicSpline(support), "wendland": WendlandC2(support)}
-        tables = {"kernels": shapes(kernels, support), "history": history, **compare(kernels, unseen)}
-        tables["errors"] |= errors_of_kriging(kernels["learned"], unseen, scales)
+        errors, slices = compare(kernels, unseen)
+        errors |= errors_of_kriging(kernels["learned"], unseen, scales)
+    tables = {"kernels": shapes(kernels, support), "history": history, "errors": errors,
+              "slices": Table(slices, "y x", {name: "1/T" if "gradient" in name else "L/T" for name in slices})}
     description = {"form": networks["learned"].formula, "support": support, "neighbors": settings.neighbors,
                    "hidden": list(settings.hidden), "cutoff": settings.cutoff,
                    "mean_volume": networks["learned"].mean_volume, "reconstruction": settings.form}
@@ -72,7 +75,6 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     save_weights(comm, directory / STAGES["train-kernel"].file, "kernel", description, weights,
                  provenance, tables)
     guard.checkpoints.remove()
-    errors = tables["errors"]
     log.info("kernel: errors of the kernel average: velocity %.3f (with a cubic spline %.3f), gradient %.3f "
              "(with a cubic spline %.3f)",
              errors["velocity_error_learned"], errors["velocity_error_cubic_spline"],
@@ -147,9 +149,9 @@ def shapes(kernels: dict[str, SmoothingKernel], support: float) -> dict[str, np.
     return table
 
 
-def compare(kernels: dict[str, SmoothingKernel], sample: KernelSample) -> dict[str, dict[str, np.ndarray]]:
-    """Return two tables; collective. `errors` has the errors and the integral of each kernel. `slices` has u_x and
-    du_x/dx in the plane z = pi."""
+def compare(kernels: dict[str, SmoothingKernel],
+            sample: KernelSample) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+    """Return the errors and the integral of each kernel, and u_x and du_x/dx in the plane z = pi; collective."""
     errors, slices = {}, {}
     slab = sample.decomposition
     slices["truth_velocity"] = _middle_plane(slab, sample.field[:, 0])
@@ -160,7 +162,7 @@ def compare(kernels: dict[str, SmoothingKernel], sample: KernelSample) -> dict[s
         errors[f"integral_{name}"] = float(integral(kernel))
         slices[f"velocity_{name}"] = _middle_plane(slab, velocity[:, 0])
         slices[f"gradient_{name}"] = _middle_plane(slab, derivative[:, 0, 0])
-    return {"errors": errors, "slices": slices}
+    return errors, slices
 
 
 def errors_of_kriging(kernel: SmoothingKernel, sample: KernelSample, scales: ReferenceScales) -> dict[str, float]:

@@ -18,7 +18,7 @@ class Coefficient:
 
     `name` is its symbol, `learned` the dimensionless parameter or parameters, and `meaning` their effect in words.
     `value` is `learned` in `unit`, for the flow of the term. A unit is a product of powers of L, T and M
-    (eddies.io.quantities); "1" means a pure number.
+    (eddies.io.units); "1" means a pure number.
     """
 
     name: str

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from eddies.clock import Clock, ProgressLine
 from eddies.flow.courant import CourantLimit, FixedStep
@@ -18,7 +19,7 @@ from eddies.flow.statistics import energy_spectrum
 from eddies.flow.tracers import FilteredField, TracerParticles, release
 from eddies.io.checkpoint import Block, Checkpoint, Guard
 from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments, TrajectoryLayout
-from eddies.io.hdf5 import File, write_table
+from eddies.io.hdf5 import File, Table, write_table
 from eddies.parallel.migration import IdOrder, id_block, migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import MEAN_DENSITY, measured_scales
@@ -154,9 +155,7 @@ class TracerSet:
 
     def write_spectra(self, file: File) -> None:
         """Write the table of unfiltered and filtered energy spectra."""
-        wavenumber = np.arange(len(self.spectra["energy"][0]))
-        columns = {name: np.array(rows) for name, rows in self.spectra.items()}
-        write_table(file, "spectra", {"wavenumber": wavenumber, **columns})
+        write_spectra(file, "spectra", "time", self.spectra)
 
 
 class TracerRun:
@@ -286,6 +285,13 @@ def frame_layout(settings: Tracers, compressible: bool, cutoff: int) -> FrameLay
         BOX_LENGTH, {f"tracers{end}": TrajectoryLayout(each.particles, columns) for end, each in sets.items()},
         np.float64, {f"filtered{end}": FieldLayout(each.cells, variables) for end, each in sets.items()}
         | {"unfiltered": FieldLayout(whole_cells(cutoff), variables)})
+
+
+def write_spectra(file: File, name: str, rows: str, columns: Mapping[str, ArrayLike]) -> None:
+    """Write a table of energy spectra E(k), k = 0, 1, ...; `rows` names the axis of the rows."""
+    wavenumber = np.arange(len(columns["energy"][0]))
+    write_table(file, name, Table({"wavenumber": wavenumber, **columns}, f"{rows} wavenumber", {
+        "time": "T", "wavenumber": "1/L", "energy": "L^2/T^2", "filtered": "L^2/T^2"}))
 
 
 def series_of(name: str) -> dict[str, str]:

@@ -7,6 +7,7 @@ import torch
 
 from eddies.analysis.lagrangian import evenly
 from eddies.clock import ProgressLine
+from eddies.io.hdf5 import Table
 from eddies.learning.force_training import TrainingFrame
 from eddies.parallel.migration import IdOrder, migrate
 from eddies.parallel.slab import SlabDecomposition
@@ -24,7 +25,7 @@ from eddies.workflows.learned.training_data import load_frame
 
 @torch.no_grad()
 def evaluate(truth: GroundTruth, model: LagrangianModel, last_seen: int,
-             dtype: torch.dtype) -> dict[str, dict[str, np.ndarray]]:
+             dtype: torch.dtype) -> dict[str, Table]:
     """Test a model at frames with a filtered field, and return tables by name; collective.
 
     The frames are evenly spread over the ground truth. `acceleration_sample` holds true and predicted accelerations at
@@ -58,10 +59,12 @@ def evaluate(truth: GroundTruth, model: LagrangianModel, last_seen: int,
             row["density_rate_error"] = relative_error(comm, errors["density_rate"], frame.density_rate)
         rows.append(row)
         progress(len(rows) / len(frames), len(rows))
-    tables = {"a_priori": {name: np.array([row[name] for row in rows]) for name in rows[0]},
-              "acceleration_sample": _sample(truth, frame, frame.acceleration, errors["acceleration"])}
+    tables = {"a_priori": Table({name: np.array([row[name] for row in rows]) for name in rows[0]},
+                                units={"delay": "T"}),
+              "acceleration_sample": _sample(truth, frame, frame.acceleration, errors["acceleration"], "L/T^2")}
     if "density_rate" in errors:
-        tables["density_rate_sample"] = _sample(truth, frame, frame.density_rate, errors["density_rate"])
+        tables["density_rate_sample"] = _sample(truth, frame, frame.density_rate, errors["density_rate"],
+                                                "M/L^3/T")
     return tables
 
 
@@ -97,12 +100,12 @@ def _pressure_error(truth: GroundTruth, index: int, frame: TrainingFrame) -> flo
     return relative_error(slab.comm, exact + given - own, acceleration)
 
 
-def _sample(truth: GroundTruth, frame: TrainingFrame, exact: torch.Tensor,
-            error: torch.Tensor) -> dict[str, np.ndarray]:
+def _sample(truth: GroundTruth, frame: TrainingFrame, exact: torch.Tensor, error: torch.Tensor, units: str) -> Table:
     """Return the true and the predicted rates of the particles with the lowest ids, the same arrays on all ranks.
     `error` is the predicted rate minus the true rate."""
     comm = truth.decomposition.comm
     order = IdOrder(comm, as_numpy(frame.particles.id), truth.total)
     own = max(TESTED_PARTICLES - order.start, 0)
     columns = {"truth": as_numpy(exact.double()), "predicted": as_numpy((exact + error).double())}
-    return {name: np.concatenate(comm.allgather(order.apply(values)[:own])) for name, values in columns.items()}
+    return Table({name: np.concatenate(comm.allgather(order.apply(values)[:own])) for name, values in columns.items()},
+                 "particle xyz", dict.fromkeys(columns, units))
