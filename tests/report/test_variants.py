@@ -34,10 +34,18 @@ def test_what_became_unstable_is_a_cross_at_the_top():
     assert crosses[0].get_ydata() > max(r["velocity_kl"] or 0 for r in ROWS)
 
 
+def named(*rows):
+    return texts(scatter(ErrorAgainstTime([ROWS[0], *rows], "learned"), ["velocity_error_early"]).axes[0])
+
+
 def test_the_subject_and_the_most_accurate_of_the_front_are_named():
-    front = [row(f"grid-{number}", 1.5 + number, 0.4 / (1 + number), kind="coarse grid") for number in range(8)]
-    axis = scatter(ErrorAgainstTime([*ROWS[:3], *front], "learned"), ["velocity_error_early"]).axes[0]
-    assert texts(axis) == {"learned", *(f"grid-{number}" for number in range(9 - MOST_NAMED, 8))}
+    front = [row(f"grid-{number}", 30 * 3.0**number, 0.01 / 9.0**number, kind="coarse grid") for number in range(8)]
+    assert named(*front) == {"learned", *(f"grid-{number}" for number in range(9 - MOST_NAMED, 8))}
+
+
+def test_few_points_are_all_named_and_points_side_by_side_once():
+    assert named(row("slow", 90.0, 0.4), row("none", 1.0, 0.5)) == {"learned", "slow", "none"}
+    assert named(row("beside", 20.5, 0.101), row("none", 1.0, 0.5)) == {"learned", "none"}
 
 
 @pytest.mark.parametrize("kinds", [1, 6])

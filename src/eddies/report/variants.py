@@ -27,7 +27,7 @@ COSTS = {"end": "end of the rollout (T)", "stopped_at": "became unstable at (T)"
          "training_steps": "training (steps)", "step_seconds": "search for the step (s)",
          "break_even_simulation": "cheaper than the direct simulation after (T)",
          "break_even_grid": "cheaper than the cheapest grid of equal or smaller error at T/2 after (T)"}
-MOST_NAMED = 6
+MOST_NAMED, ROOM = 6, (0.18, 0.06)  # ROOM: width and height of a name, in those of a panel
 LEGEND = ("Wall seconds per turnover T, with the quartiles of the time of a step as bars. Bars of errors are standard "
           "deviations over realisations, if there are several. Dashed line: Pareto front, the variants that no other "
           "one beats in both error and time. Names: the variant of this page, bold, and the best of the front. "
@@ -168,12 +168,25 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
     axis.plot([rows[index][COST] for index in front], [rows[index][measure] for index in front], color=GUIDE,
               linestyle="--", linewidth=1.2, zorder=1)
     axis.set(xlabel="wall seconds per turnover T", ylabel=in_symbols(MEASURES[measure]))
-    named = [row for row in rows if row["name"] == table.subject]
-    named += [rows[index] for index in front[::-1] if rows[index] not in named][:MOST_NAMED - len(named)]
-    for number, row in enumerate(sorted(named, key=lambda row: row[COST])):
-        axis.annotate(row["label"], (row[COST], row[measure]), (7, 7 if number % 2 else -7), va="center",
-                      textcoords="offset points", fontsize=8.5, annotation_clip=False, zorder=5,
-                      fontweight="bold" if row["name"] == table.subject else "normal")
+    for row in _named(axis, table, rows, measure, front):
+        axis.annotate(row["label"], (row[COST], row[measure]), (6, 6), textcoords="offset points", fontsize=8.5,
+                      annotation_clip=False, zorder=5, fontweight="bold" if row["name"] == table.subject else "normal")
+
+
+def _named(axis: Axes, table: ErrorAgainstTime, rows: Sequence[Row], measure: str, front: Sequence[int]) -> list[Row]:
+    """Return at most MOST_NAMED rows whose points get a name: the subject, the most accurate of the front and, if there
+    are few points, the others. A point beside a named one gets none."""
+    wanted = [row for row in rows if row["name"] == table.subject] + [rows[index] for index in front[::-1]]
+    if len(rows) <= MOST_NAMED:
+        wanted += rows
+    named: list[Row] = []
+    places: list[np.ndarray] = []
+    for row in wanted:
+        place = axis.transAxes.inverted().transform(axis.transData.transform((row[COST], row[measure])))
+        if len(named) < MOST_NAMED and all((abs(place - other) > ROOM).any() for other in places):
+            named.append(row)
+            places.append(place)
+    return named
 
 
 def in_symbols(words: str) -> str:
