@@ -12,8 +12,8 @@ export OMPI_MCA_mpi_yield_when_idle=1
 unset PYTHONDONTWRITEBYTECODE
 failed=0
 log=$(mktemp)
-# The tests send interrupts to jobs, which would inherit from a job in the background that it ignores them.
-env --default-signal=INT .venv/bin/python -m pytest "$@" > "$log" 2>&1 &
+# The tests send signals to jobs, which would inherit that they are ignored: in the background, or under nohup.
+env --default-signal=INT,HUP .venv/bin/python -m pytest "$@" > "$log" 2>&1 &
 unmarked=$!
 trap 'kill $unmarked 2> /dev/null || true; rm "$log"' EXIT
 for ranks in 1 2 3; do
