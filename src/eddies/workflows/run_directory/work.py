@@ -59,7 +59,7 @@ BOTH = ("product", "checkpoints")
 COURSES = {
     "none": (Course("anew"), Course("continue"), Course("anew", True, ("checkpoints",))),
     # What is left of a complete run is removed. Checkpoints of other settings may still be continued.
-    "same": (Course("skip"), Course("skip", True), Course("skip")),
+    "same": (Course("skip", True), Course("skip", True), Course("skip")),
     "shorter": (Course("anew", False, ("product",)), Course("continue"), Course("anew", True, BOTH)),
     # The checkpoint may lie after the end of the run.
     "longer": (Course("anew", False, ("product",)), Course("anew", True, ("product",)), Course("anew", True, BOTH)),
