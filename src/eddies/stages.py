@@ -33,7 +33,7 @@ from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.learned.source import ModelDefinition, read_source
 from eddies.workflows.problems import check_ground_truth, directory_problems, memory_of_node, problems
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
-from eddies.workflows.run_directory.work import FAILURE, SECONDS, Course, find_work, link_products, stage_seconds
+from eddies.workflows.run_directory.work import FAILURE, SECONDS, find_work, link_products, stage_seconds
 from eddies.workflows.variants import Step, steps
 
 log = logging.getLogger("eddies")
@@ -145,10 +145,10 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
     checked = False  # whether the ground truth was checked for the stages that need it
     for number, name in enumerate(step.stages):
         stage = STAGES[name]
-        course = work.courses[name] if stage.product is not None else Course("anew")
-        if course.drops and stage.checkpoints is not None:
+        action = work.actions[name]
+        if action.drops and stage.checkpoints is not None:
             CheckpointDirectory(comm, directory / stage.checkpoints, "").remove()
-        if course.start == "skip":
+        if action.start == "skip":
             log.info("%s: skipped, %s is complete and made with the same settings", name, stage.file)
             if name == "train-kernel" and scene.kernel is not None:
                 from eddies.workflows.train_kernel import keep_form  # imports torch
@@ -160,7 +160,7 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
                             scene.seen_in(directory))
             check_ground_truth(directory / STAGES["dns"].file, later, scene.simulation, check, comm)
             checked = True
-        run_stage(name, (scene, comm, directory, stop), comm, directory, stop, course.start == "continue")
+        run_stage(name, (scene, comm, directory, stop), comm, directory, stop, action.start == "continue")
 
 
 def run_stage(name: str, arguments: Sequence[Any], comm: Comm, directory: Path, stop: StopRequest,

@@ -100,7 +100,7 @@ def test_variants_of_one_set_are_measured_alike(tmp_path):
 
 
 def start(scene, directory):
-    return find_work(["dns"], scene, directory).courses["dns"].start
+    return find_work(["dns"], scene, directory).actions["dns"].start
 
 
 @pytest.mark.mpi(1)
@@ -115,7 +115,7 @@ def test_a_lost_ground_truth_of_a_set_is_made_again(comm, tmp_path):
     (line,) = [line for line in status_lines(tmp_path) if line.startswith("  dns")]
     assert line.endswith("lacks the ground truth of few")
     kept = product_provenance(tmp_path / "whole" / "ground_truth.h5")
-    assert start(scene, tmp_path) == "anew" and not find_work(["dns"], scene, tmp_path).lost
+    assert start(scene, tmp_path) == "begin" and not find_work(["dns"], scene, tmp_path).lost
     dns.run(scene, comm, tmp_path)
     assert product_provenance(tmp_path / "whole" / "ground_truth.h5") == kept  # what was made from it stays valid
     assert (tmp_path / "whole" / "scene.toml").read_text() == "# of another scene"
@@ -147,7 +147,7 @@ def test_a_stopped_simulation_with_sets_goes_on_for_longer(comm, tmp_path, caplo
     assert start(longer, tmp_path) == "continue"
     dns.run(longer, comm, tmp_path)
     assert "continues from step 11" in caplog.text
-    assert start(load_scene(TINY, [*SPLIT, *SETS]), tmp_path) == "anew"
+    assert start(load_scene(TINY, [*SPLIT, *SETS]), tmp_path) == "begin"
 
 
 @pytest.mark.mpi(1)

@@ -37,7 +37,7 @@ def save(comm, directory, scene, stage, step):
 
 
 def starts(work):
-    return {stage: course.start for stage, course in work.courses.items()}
+    return {stage: action.start for stage, action in work.actions.items()}
 
 
 FOUND = {"none": None, "same": "tracers.turnovers=0.6", "shorter": "tracers.turnovers=0.5",
@@ -48,24 +48,24 @@ PRODUCT, BOTH = ["ground_truth.h5"], ["ground_truth.h5", "checkpoints"]
 
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("product, checkpoints, start, drops, lost", [
-    ("none", "no", "anew", False, []),
+    ("none", "no", "begin", False, []),
     ("none", "fitting", "continue", False, []),
-    ("none", "foreign", "anew", True, ["checkpoints"]),
+    ("none", "foreign", "begin", True, ["checkpoints"]),
     ("same", "no", "skip", False, []),
     ("same", "fitting", "skip", False, []),
     ("same", "foreign", "skip", False, []),
-    ("shorter", "no", "anew", False, PRODUCT),
+    ("shorter", "no", "begin", False, PRODUCT),
     ("shorter", "fitting", "continue", False, []),
-    ("shorter", "foreign", "anew", True, BOTH),
-    ("longer", "no", "anew", False, PRODUCT),
-    ("longer", "fitting", "anew", True, PRODUCT),
-    ("longer", "foreign", "anew", True, BOTH),
-    ("other", "no", "anew", False, PRODUCT),
+    ("shorter", "foreign", "begin", True, BOTH),
+    ("longer", "no", "begin", False, PRODUCT),
+    ("longer", "fitting", "begin", True, PRODUCT),
+    ("longer", "foreign", "begin", True, BOTH),
+    ("other", "no", "begin", False, PRODUCT),
     ("other", "fitting", "continue", False, PRODUCT),
-    ("other", "foreign", "anew", True, BOTH),
-    ("damaged", "no", "anew", False, PRODUCT),
+    ("other", "foreign", "begin", True, BOTH),
+    ("damaged", "no", "begin", False, PRODUCT),
     ("damaged", "fitting", "continue", False, PRODUCT),
-    ("damaged", "foreign", "anew", True, BOTH),
+    ("damaged", "foreign", "begin", True, BOTH),
 ])
 def test_what_is_found_decides_what_a_run_does(comm, tmp_path, scene, product, checkpoints, start, drops, lost):
     """The table of cases, for the direct simulation of a scene with 0.6 turnovers."""
@@ -83,7 +83,7 @@ def test_what_is_found_decides_what_a_run_does(comm, tmp_path, scene, product, c
         CheckpointDirectory(comm, tmp_path / "checkpoints", stage_fingerprint(of, "dns", DURATION_KEYS["dns"])).write(
             5, {"a": 1})
     work = find_work(["dns"], scene, tmp_path)
-    assert (work.courses["dns"].start, work.courses["dns"].drops) == (start, drops)
+    assert (work.actions["dns"].start, work.actions["dns"].drops) == (start, drops)
     assert [each.split()[0] for each in work.lost] == lost
     if lost:
         with pytest.raises(WouldReplaceWork, match="--overwrite"):
@@ -100,19 +100,19 @@ def test_the_last_state_of_a_product_is_not_listed_beside_it(comm, tmp_path, sce
     with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", provenance):
         pass
     work = find_work(["dns"], load_scene(TINY, ["seed=5"]), tmp_path)
-    assert [each.split()[0] for each in work.lost] == ["ground_truth.h5"] and work.courses["dns"].drops
+    assert [each.split()[0] for each in work.lost] == ["ground_truth.h5"] and work.actions["dns"].drops
 
 
 @pytest.mark.mpi(1)
 def test_what_fits_is_done_whatever_is_to_be_made_before_it(comm, tmp_path, scene):
     for directory in (tmp_path, tmp_path / "nowhere"):
         work = find_work(scene.stages, scene, directory)
-        assert {*starts(work).values()} == {"anew"} and not work.lost
+        assert {*starts(work).values()} == {"begin"} and not work.lost
     leave(comm, tmp_path, scene)
     assert {*starts(find_work(MAKING, scene, tmp_path)).values()} == {"skip"}
     (tmp_path / "kernel.h5").unlink()
     work = find_work(MAKING, scene, tmp_path)
-    assert starts(work) == dict.fromkeys(MAKING, "skip") | {"train-kernel": "anew"} and not work.lost
+    assert starts(work) == dict.fromkeys(MAKING, "skip") | {"train-kernel": "begin"} and not work.lost
     # A link is not work, whatever it leads to.
     leave(comm, tmp_path, load_scene(TINY, ["kernel.steps=5"]), ["train-kernel"])
     (tmp_path / "here").mkdir()
@@ -134,7 +134,7 @@ def test_what_would_be_replaced_is_named_with_cost_and_reason(comm, tmp_path, sc
     (tmp_path / "stage_seconds.json").write_text(json.dumps({"dns": 125, "simulate": 3.2}))
     work = find_work(stages, load_scene(TINY, [change]), tmp_path)
     assert [each.split()[0] for each in work.lost] == lost
-    assert starts(work) == {stage: "anew" if STAGES[stage].file in lost else "skip" for stage in stages}
+    assert starts(work) == {stage: "begin" if STAGES[stage].file in lost else "skip" for stage in stages}
     if not lost:
         return work.refuse_to_lose()
     with pytest.raises(WouldReplaceWork) as refused:
@@ -159,7 +159,7 @@ def test_checkpoints_that_would_be_lost_are_named_with_step_time_and_reason(comm
     save(comm, tmp_path, scene, "train", 3)
     assert not find_work(scene.stages, scene, tmp_path).lost  # there is one to go on from
     (tmp_path / "checkpoints-train/step-00000003.h5").write_text("damaged")
-    assert find_work(scene.stages, scene, tmp_path).courses["train"].drops
+    assert find_work(scene.stages, scene, tmp_path).actions["train"].drops
 
 
 @pytest.mark.mpi(1)
@@ -167,8 +167,8 @@ def test_checkpoints_left_beside_a_model_are_removed(comm, tmp_path, scene):
     """Those of a direct simulation stay, because a longer run continues from them."""
     leave(comm, tmp_path, scene, ["train"])
     save(comm, tmp_path, scene, "train", 7)
-    course = find_work(["train"], scene, tmp_path).courses["train"]
-    assert course.start == "skip" and course.drops
+    action = find_work(["train"], scene, tmp_path).actions["train"]
+    assert action.start == "skip" and action.drops
 
 
 @pytest.mark.mpi(1)

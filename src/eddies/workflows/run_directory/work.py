@@ -40,11 +40,11 @@ class WouldReplaceWork(UserError):
     """A command would replace work that was made with other settings."""
 
 
-class Course(NamedTuple):
+class Action(NamedTuple):
     """What a run does with the work of a stage that it finds.
 
-    start: "skip" the stage, "continue" from its checkpoint, or start "anew". drops: whether its checkpoints are removed
-    first. loses: which of "product" and "checkpoints" hold work that would be lost.
+    start: "skip" the stage, "continue" from its checkpoint, or "begin" it. drops: whether the checkpoints are removed
+    first. loses: the work that would be lost, of "product" and "checkpoints".
     """
 
     start: str
@@ -52,18 +52,19 @@ class Course(NamedTuple):
     loses: tuple[str, ...] = ()
 
 
-BOTH = ("product", "checkpoints")
-#: The course by what is found: first the product, then no checkpoint, those of the same settings, those of others.
-#: The product is that of no run, of the same settings, of the same settings but a shorter or longer time, or of others
-#: (or damaged). Checkpoints of the same settings may differ in the time, too.
-COURSES = {
-    "none": (Course("anew"), Course("continue"), Course("anew", True, ("checkpoints",))),
-    # What is left of a complete run is removed. Checkpoints of other settings may still be continued.
-    "same": (Course("skip", True), Course("skip", True), Course("skip")),
-    "shorter": (Course("anew", False, ("product",)), Course("continue"), Course("anew", True, BOTH)),
+BEGIN, CONTINUE, SKIP = Action("begin"), Action("continue"), Action("skip")
+LOSE_PRODUCT, LOSE_BOTH = Action("begin", False, ("product",)), Action("begin", True, ("product", "checkpoints"))
+#: What a run does. Rows: the product that is found. Columns: no checkpoints; some of the same settings; only others.
+#: "shorter" and "longer" have the same settings as the run but another duration. A damaged product is in row "other".
+#: Checkpoints of the same settings may have another duration.
+ACTIONS = {
+    "none": (BEGIN, CONTINUE, Action("begin", True, ("checkpoints",))),
+    # Checkpoints of a complete run are removed. Those of other settings may still be continued.
+    "same": (Action("skip", True), Action("skip", True), SKIP),
+    "shorter": (LOSE_PRODUCT, CONTINUE, LOSE_BOTH),
     # The checkpoint may lie after the end of the run.
-    "longer": (Course("anew", False, ("product",)), Course("anew", True, ("product",)), Course("anew", True, BOTH)),
-    "other": (Course("anew", False, ("product",)), Course("continue", False, ("product",)), Course("anew", True, BOTH)),
+    "longer": (LOSE_PRODUCT, Action("begin", True, ("product",)), LOSE_BOTH),
+    "other": (LOSE_PRODUCT, Action("continue", False, ("product",)), LOSE_BOTH),
 }
 
 
@@ -72,7 +73,7 @@ class Work:
     """The work that stages find in a run directory."""
 
     directory: Path
-    courses: Mapping[str, Course]  # what a run does, by stage
+    actions: Mapping[str, Action]  # by stage
     lost: tuple[str, ...]  # the files that the stages would replace, each with its wall time or date
     changes: tuple[str, ...]  # the settings that differ from those of the lost files
 
@@ -92,76 +93,68 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
     replaced and `overwrite` is false. Raises ProductError if the system refuses to read a product or a checkpoint: such
     a file may be undamaged, and must not be replaced.
     """
-    courses, lost, changes = {}, [], {}
+    seconds, actions, lost = stage_seconds(directory), {}, {}
+    changes: dict[str, None] = {}
     for stage in [STAGES[name] for name in (*links, *stages) if STAGES[name].product is not None]:
-        found = FoundWork.of(stage, scene, directory)
-        courses[stage.name] = found.course
-        lost += found.lost
-        for then in found.scenes_of_lost:
+        actions[stage.name], of_stage = _work_of(stage, scene, directory, seconds.get(stage.name))
+        lost |= of_stage
+        for then in of_stage.values():
             changes |= dict.fromkeys(changed_settings(stage, then, scene.to_toml()))
-    work = Work(directory, courses, tuple(lost), tuple(changes))
+    work = Work(directory, actions, tuple(lost), tuple(changes))
     if not overwrite:
         work.refuse_to_lose()
     return work
 
 
-@dataclass(frozen=True)
-class FoundWork:
-    """The work of one stage in a run directory: its course, and the files that would be lost.
+def _work_of(stage: Stage, scene: Scene, directory: Path,
+             seconds: float | None) -> tuple[Action, dict[str, str | None]]:
+    """Return what a run does with the work of a stage, and the files that would be lost.
 
-    lost: their names, each with its cost. scenes_of_lost: the scenes with which they were made, as text; None if
-    unknown.
+    The files are a dict from their names, with their cost, to the scene with which they were made, as text; None if it
+    is unknown. `seconds` is the wall time of the stage.
     """
-
-    course: Course
-    lost: list[str]
-    scenes_of_lost: list[str | None]
-
-    @classmethod
-    def of(cls, stage: Stage, scene: Scene, directory: Path) -> FoundWork:
-        """Return the work of a stage in `directory`."""
-        origin, checkpoints = product_provenance(directory / stage.file), []
-        if stage.checkpoints:
-            checkpoints = checkpoints_in(directory / stage.checkpoints)
-        sets = _other_sets(scene, directory) if stage.name == "dns" else {}
-        product = _product_state(stage, scene, directory / stage.file, origin)
-        if sets and product == "same":  # the whole is there, but not all its parts
-            product = "none"
-        continued = stage_fingerprint(scene, stage.name, DURATION_KEYS.get(stage.name, ()))
-        fingerprints = [fingerprint for _, fingerprint in checkpoints]
-        course = COURSES[product][0 if not checkpoints else 1 if continued in fingerprints else 2]
-        if stage.name == "dns" and course == Course("skip", True):
-            course = Course("skip")  # the last state serves a longer run
-        seconds = stage_seconds(directory).get(stage.name)
-        lost = {f"{path}{_cost(other, None)}": other.get("scene") for path, other in sets.items()
-                if (directory / path).is_file()}
-        if "product" in course.loses:
-            lost[stage.file + _cost(origin, seconds)] = origin.get("scene")
-        if "checkpoints" in course.loses and origin.get("course") not in fingerprints:  # else the product's last state
-            took = "" if seconds is None else f", took {duration(seconds)}"
-            lost[f"{stage.checkpoints} (step {checkpoints[0][0]}{took})"] = _scene_of(directory)
-        return cls(course, list(lost), list(lost.values()))
+    origin = product_provenance(directory / stage.file)
+    checkpoints = checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
+    fingerprints = [fingerprint for _, fingerprint in checkpoints]
+    continued = stage_fingerprint(scene, stage.name, DURATION_KEYS.get(stage.name, ()))
+    sets = _other_sets(scene, directory) if stage.name == "dns" else {}
+    product = _product_state(stage, scene, directory / stage.file, origin, continued)
+    if sets and product == "same":  # not all its parts are there
+        product = "none"
+    action = ACTIONS[product][0 if not checkpoints else 1 if continued in fingerprints else 2]
+    if stage.name == "dns" and action.start == "skip":
+        action = SKIP  # the last state serves a longer run
+    lost = {f"{path}{_cost(other, None)}": other.get("scene") for path, other in sets.items()
+            if (directory / path).is_file()}
+    if "product" in action.loses:
+        lost[stage.file + _cost(origin, seconds)] = origin.get("scene")
+    if "checkpoints" in action.loses and origin.get("course") not in fingerprints:  # else the product's last state
+        took = "" if seconds is None else f", took {duration(seconds)}"
+        lost[f"{stage.checkpoints} (step {checkpoints[0][0]}{took})"] = _scene_of(directory)
+    return action, lost
 
 
-def _product_state(stage: Stage, scene: Scene, product: Path, origin: Mapping[str, Any]) -> str:
-    """Return which row of COURSES holds for a product. `origin` is its provenance, empty if it cannot be read."""
+def _product_state(stage: Stage, scene: Scene, product: Path, origin: Mapping[str, Any], continued: str) -> str:
+    """Return which row of ACTIONS holds for a product.
+
+    `origin` is its provenance, empty if it cannot be read. `continued` is the fingerprint of the stage without its
+    duration.
+    """
     if origin.get("fingerprint") == stage_fingerprint(scene, stage.name):
         return "same"
     if not product.is_file() or product.is_symlink():  # a link is not work
         return "none"
     if not origin:
         _check_readable(product)
-    if stage.name in DURATION_KEYS and origin.get("course") == stage_fingerprint(scene, stage.name,
-                                                                                 DURATION_KEYS[stage.name]):
+    if origin.get("course") == continued:
         return "longer" if origin["duration"] > scene.duration else "shorter"
     return "other"
 
 
 def _other_sets(scene: Scene, directory: Path) -> dict[Path, dict[str, Any]]:
-    """Return the provenance of each ground truth of a set of tracers that lacks or has other settings, by path."""
-    origins = {path: product_provenance(directory / path) for path in set_files(scene)}
-    return {path: origins[path] for path, wanted in set_files(scene).items()
-            if origins[path].get("fingerprint") != wanted}
+    """Return, by path, the provenance of each set's ground truth that is missing or has other settings."""
+    origins = {path: (product_provenance(directory / path), wanted) for path, wanted in set_files(scene).items()}
+    return {path: origin for path, (origin, wanted) in origins.items() if origin.get("fingerprint") != wanted}
 
 
 def link_products(products: Mapping[Path, str], directory: Path) -> None:
