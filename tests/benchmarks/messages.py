@@ -1,9 +1,9 @@
 """Messages and bytes that a rank sends in an evaluation of a particle model, by numbers of ranks.
 
-    .venv/bin/python tests/benchmarks/messages.py [PARTICLES A SIDE] [--models NAME ...] [--ranks R ...]
+    PYTHONPATH=. .venv/bin/python tests/benchmarks/messages.py [PARTICLES A SIDE] [--models NAME ...] [--ranks R ...]
 
 Open MPI counts what each rank sends to each other one (its component pml_monitoring). Collective operations count as
-the messages of which they consist. The difference between a job of twelve and one of six steps leaves out the start.
+the messages of which they consist. The difference between a job of four and one of two steps leaves out the start.
 Prints a JSON line for each model and number of ranks: the largest count over ranks and the mean.
 """
 
@@ -24,7 +24,7 @@ from particle_step import Run
 from eddies.scene.terms import PRESETS
 from mpi_tools.launch import mpi_environment, mpirun_command
 
-STEPS = 6
+STEPS = 2
 MODELS = ("paper", "local", "resolved")
 
 

@@ -7,7 +7,7 @@ import torch
 from eddies.flow.tracers import release
 from eddies.learning.optimization import shared_values
 from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow, energy_units
-from eddies.parallel.migration import migrate
+from eddies.parallel.migration import IdOrder
 from eddies.parallel.reduction import global_max
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
@@ -23,8 +23,7 @@ ITERATIONS = 8  # of each solve for the resolved velocity, on any number of rank
 
 
 def resolution(slab):
-    """The resolved velocity, with ghost planes for particles that leave their slab within four intervals."""
-    return solving(ResolvedVelocity.on_slabs(slab, SCALES, 2 * SPACING), ITERATIONS)
+    return solving(ResolvedVelocity.on_slabs(slab, SCALES), ITERATIONS)
 
 
 def solving(resolved, iterations):
@@ -35,13 +34,13 @@ def solving(resolved, iterations):
 
 
 def window_of(slab, with_density):
-    """Particles in a smooth flow that changes slowly, with true velocities, and energies that decay by a tenth in each
-    frame. Particles without acceleration keep their energies."""
+    """Particles in a smooth flow that changes slowly and moves along z, with true velocities, and energies that decay
+    by a tenth in each frame. Particles without acceleration keep their energies."""
     columns = release(slab, 3, PER_SIDE**3, "random")
     x, y, z = columns["position"].T
 
     def velocity(turned):
-        return np.stack([np.sin(y + turned), np.sin(z + turned), 1.5 + np.sin(x + turned)], axis=1)
+        return np.stack([np.sin(y + turned), np.sin(z + turned), 9 + np.sin(x + turned)], axis=1)
 
     def density(turned):
         return 1 + 0.01 * np.cos(x + turned) * np.cos(y)
@@ -49,8 +48,9 @@ def window_of(slab, with_density):
     times = INTERVAL * np.arange(1, FRAMES + 1)
     later = {"velocity_later": np.stack([velocity(time) for time in times], axis=1),
              "density_later": np.stack([density(time) for time in times], axis=1)}
-    columns = migrate(slab, {**columns, "velocity": velocity(0.0), "density": density(0.0), **later})
-    columns = {name: torch.from_numpy(column) for name, column in columns.items()}
+    order = IdOrder(slab.comm, columns["id"], PER_SIDE**3)
+    columns = {name: torch.from_numpy(order.apply(column)) for name, column in {
+        **columns, "velocity": velocity(0.0), "density": density(0.0), **later}.items()}
     true = {name: columns.pop(f"{name}_later").movedim(1, 0).contiguous() for name in ("velocity", "density")}
     if not with_density:
         del columns["density"], true["density"]
@@ -63,7 +63,7 @@ def window_of(slab, with_density):
 def trainer_of(comm, preset="resolved + pairs", integrator="verlet", steps=1, iterations=ITERATIONS):
     slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
     model = model_of(preset, SUPPORT, 17, (6, 5))
-    dynamics = ParticleDynamics(slab, model, 0.0, torch.float64, fixed_ranks=True, drift=2 * SPACING)
+    dynamics = ParticleDynamics(slab, model, 0.0, torch.float64)
     if dynamics.resolution is not None:
         solving(dynamics.resolution, iterations)
     window = window_of(slab, model.integrates_density)
@@ -125,13 +125,16 @@ def test_gradient_with_the_tolerance_of_training(comm):
 
 
 @pytest.mark.mpi(3)
-def test_particles_leave_their_slabs_within_a_window(comm):
-    """The tests of ranks cover this: the flow along z carries particles beyond the neighbouring planes."""
+def test_particles_cross_a_slab_within_a_window(comm):
+    """The tests of ranks cover this: the flow along z carries particles to the rank after the next."""
     trainer, _ = trainer_of(comm)
+    window = trainer.windows[0]
     with torch.no_grad():
-        *_, (_, particles) = trainer._frames(trainer.windows[0].particles, FRAMES)
+        *_, (_, particles) = trainer._frames(window.particles, FRAMES)
     slab = trainer.integrator.dynamics.decomposition
-    assert global_max(comm, float(particles.position[:, 2].max()) - slab.upper) > SPACING
+    assert torch.equal(particles.id, window.particles.id)  # they come back in their order
+    moved = particles.position[:, 2] - window.particles.position[:, 2]
+    assert global_max(comm, float(moved.max())) > slab.planes // slab.size * slab.spacing
 
 
 @pytest.mark.mpi(1)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from eddies.parallel.migration import IdOrder, ParticleLossError, Redistribution, census, migrate, wrap
+from eddies.parallel.migration import IdOrder, Migration, ParticleLossError, Redistribution, census, migrate, wrap
 from eddies.parallel.slab import SlabDecomposition
 
 LENGTH = 2 * np.pi
@@ -27,6 +27,16 @@ def test_every_particle_arrives_where_it_is_with_all_its_columns(comm, total):
     assert np.array_equal(moved["tensor"], position[moved["id"]][:, :, None] * [1.0, 2.0])
     assert moved["flag"].dtype == np.float32
     assert census(comm, moved["id"])[0] == total
+
+
+@pytest.mark.mpi(1, 3)
+def test_the_adjoint_sends_each_row_back(comm):
+    columns, _ = scattered(comm, 50)
+    for order in (Migration(SlabDecomposition(comm, LENGTH, 7), columns["id"], wrap(columns["position"], LENGTH)),
+                  IdOrder(comm, columns["id"], 50)):
+        for name, column in columns.items():
+            back = order.adjoint(order.apply(column))
+            assert back.dtype == column.dtype and np.array_equal(back, column), name
 
 
 @pytest.mark.mpi(1, 3)

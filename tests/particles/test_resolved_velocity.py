@@ -98,7 +98,7 @@ def test_a_rank_without_particles_takes_part_there_and_back(comm):
     position = positions(count=300) * torch.tensor([1.0, 1.0, 0.3], dtype=torch.float64)
     slab, particles = distributed(comm, position, torch.randn(300, 3, dtype=torch.float64), planes=PLANES)
     assert comm.rank != 2 or len(particles) == 0
-    dynamics = dynamics_of(slab, lagrangian(), fixed_ranks=True)
+    dynamics = dynamics_of(slab, lagrangian())
     columns = [column.clone().requires_grad_() for column in (particles.position, particles.velocity)]
     dynamics.rates(replace(particles, position=columns[0], velocity=columns[1])).acceleration.square().sum().backward()
     assert all(torch.isfinite(column.grad).all() for column in columns)
@@ -110,14 +110,14 @@ def test_all_ranks_refuse_a_particle_beyond_the_ghost_planes(comm):
     if comm.rank == 1:
         particles.position[0, 2] = slab.upper + 1.5 * slab.spacing
     with pytest.raises(HaloError, match="shorten the time step"):
-        dynamics_of(slab, lagrangian(), fixed_ranks=True).rates(particles)
+        dynamics_of(slab, lagrangian()).rates(particles)
 
 
 @pytest.mark.mpi(2)
 def test_gradient_of_density_and_force_against_central_differences(comm):
     """Through the solve, transforms and splines, by positions, velocities and parameters."""
     slab, particles, _ = in_known_flow(comm, 6, planes=12)
-    dynamics = dynamics_of(slab, lagrangian(side=6), tolerance=1e-11, fixed_ranks=True)
+    dynamics = dynamics_of(slab, lagrangian(side=6), tolerance=1e-11)
     dynamics.resolution.most_iterations = 1000
     random = np.random.default_rng(comm.rank)
     weights = [torch.from_numpy(random.standard_normal(shape)) for shape in ((len(particles),), (len(particles), 3))]

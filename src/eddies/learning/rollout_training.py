@@ -15,21 +15,20 @@ from torch.utils.checkpoint import checkpoint
 from eddies.learning.losses import mean_square_share
 from eddies.learning.optimization import Adam, shared_values
 from eddies.parallel.communicator import Comm
+from eddies.parallel.migration import IdOrder
 from eddies.parallel.reduction import global_sum
-from eddies.particles.exchanges import root_mean_square
+from eddies.particles.exchanges import redistributed, root_mean_square
 from eddies.particles.integrators import Integrator
-from eddies.particles.particle_set import ParticleSet
+from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.resolved_velocity import ResolvedVelocity
 
 # Lower bound of the unit of a band's energy error (see `energy_units`), as a share of the largest unit of any band.
 SLOWEST = 0.1
-# Largest component of the velocity of a particle, divided by the rms u' of a component: expected, and allowed.
-PEAK_VELOCITY, ALLOWED_VELOCITY = 4.0, 6.0
 
 
 @dataclass(frozen=True)
 class TrainingWindow:
-    """Particles at one time and their true future.
+    """Particles at one time and their true future, in the order of their ids, each rank a block of ids (`id_block`).
 
     Parameters
     ----------
@@ -62,13 +61,13 @@ class RolloutTrainer:
     much energy from some scales and too little from others, and the error of the velocity hardly shows this.
 
     The gradient is that of the whole rollout. It goes through the forces of all steps, the distances of neighbours, the
-    halo, and the grid of the resolved velocity. The backward pass computes each step again, so that memory holds the
-    intermediate results of only one step.
+    halo, the changes of rank, and the grid of the resolved velocity. The backward pass computes each step again, so
+    that memory holds the intermediate results of only one step.
 
     Parameters
     ----------
-    integrator : advances the particles. Its dynamics must have `fixed_ranks`.
-    windows : true trajectories of the particles in this rank's slab.
+    integrator : advances the particles.
+    windows : true trajectories of the particles.
     frame_interval, steps_per_frame : time between frames, and number of time steps in this time.
     energy_weight : weight of the energy loss; if it is zero, windows need no energies.
     resolution : computes the band energies of particles; unused if `energy_weight` is zero.
@@ -142,38 +141,38 @@ class RolloutTrainer:
         return ((energies - true) / (true * self.units[frame])).square().mean() / self.comm.size
 
     def _frames(self, particles: ParticleSet, horizon: int) -> Iterator[tuple[int, ParticleSet]]:
-        """Yield the number, from 0 on, and the particles of each frame that the rollout reaches."""
+        """Yield the number, from 0 on, and the particles, in the order of their ids, of each frame that the rollout
+        reaches."""
         memory: dict[str, Tensor] = {}
         self.integrator.dynamics.begin()
         for reached in range(horizon):
             for _ in range(self.steps_per_frame):
                 particles, memory = self._advanced(particles, memory)
-            yield reached, particles
+            order = IdOrder(self.comm, as_numpy(particles.id), self.total)
+            yield reached, ParticleSet(**{name: redistributed(order, column)
+                                          for name, column in particles.columns().items()})
 
     def _advanced(self, particles: ParticleSet, memory: dict[str, Tensor]) -> tuple[ParticleSet, dict[str, Tensor]]:
         """Return the particles and the integrator's memory after one time step.
 
         The backward pass computes the step again.
         """
-        given, carried, after = particles.columns(), list(memory), ([], [])
+        given, carried, after = list(particles.columns()), list(memory), ([], [])
         state = self.integrator.dynamics.state_dict()
-        del given["id"]
 
         def advance(*columns: Tensor) -> tuple[Tensor, ...]:
             # The neighbour list is rebuilt and the predictions are restored, so that the backward pass repeats the
             # step exactly.
             self.integrator.dynamics.forget()
             self.integrator.dynamics.load_state_dict(state)
-            start = ParticleSet(particles.id, **dict(zip(given, columns)))
+            start = ParticleSet(**dict(zip(given, columns)))
             self.integrator.restore(start, dict(zip(carried, columns[len(given):])))
-            end = self.integrator.step(start, self.time_step).columns()
-            del end["id"]
-            after[0][:], after[1][:] = end, self.integrator.memory
-            return *end.values(), *self.integrator.memory.values()
+            end, rates = self.integrator.step(start, self.time_step).columns(), self.integrator.memory
+            after[0][:], after[1][:] = end, rates
+            return *end.values(), *rates.values()
 
-        columns = _recomputed(advance, *given.values(), *memory.values())
-        moved = ParticleSet(particles.id, **dict(zip(after[0], columns)))
-        return moved, dict(zip(after[1], columns[len(after[0]):]))
+        columns = _recomputed(advance, *particles.columns().values(), *memory.values())
+        return ParticleSet(**dict(zip(after[0], columns))), dict(zip(after[1], columns[len(after[0]):]))
 
     def _errors(self, window: TrainingWindow, frame: int,
                 particles: ParticleSet) -> Iterator[tuple[str, Tensor, Tensor]]:
@@ -186,21 +185,6 @@ class RolloutTrainer:
         if self.integrator.dynamics.model.learns_density:
             true = window.density[frame]
             yield "density_loss", particles.density - true, true - window.particles.density
-
-
-def allowed_drift(velocity: float, time: float) -> float:
-    """Return the largest distance from the slab of its rank that a particle may reach in a window that lasts `time`.
-
-    `velocity` is the rms of a velocity component. Particles stay on their rank, so slabs need ghost planes for this
-    distance.
-    """
-    return ALLOWED_VELOCITY * velocity * time
-
-
-def expected_reach(radius: float, velocity: float, time: float) -> float:
-    """Return the thickness that slabs need in a window that lasts `time`, for particles with this `radius` of
-    interaction (`Neighborhood.update`). `velocity` is the rms of a velocity component."""
-    return radius + 2 * PEAK_VELOCITY * velocity * time
 
 
 # The wrapper of `checkpoint` loads torch's compiler, which takes two seconds.

@@ -29,22 +29,19 @@ class ParticleDynamics:
     skin : extra radius of neighbour list and halo. Both are rebuilt when some particle has moved by half the skin.
     dtype : precision of the resolved velocity and of computations with pairs; by default that of the positions.
         Positions stay in double precision; only their differences are converted.
-    fixed_ranks : whether particles keep their rank and row, as gradients through a few steps require. The halo then
-        widens by the largest distance of a particle from its slab.
-    drift : if a term reads the resolved velocity, a particle may be at most skin/2 + `drift` outside its slab.
 
     `time` is the time at the beginning of the present step; integrators advance it.
     """
 
     def __init__(self, decomposition: SlabDecomposition, model: LagrangianModel, skin: float,
-                 dtype: torch.dtype | None = None, fixed_ranks: bool = False, drift: float = 0.0) -> None:
-        self.decomposition, self.model, self.dtype, self.fixed_ranks = decomposition, model, dtype, fixed_ranks
+                 dtype: torch.dtype | None = None) -> None:
+        self.decomposition, self.model, self.dtype = decomposition, model, dtype
         self.box, self.time, self.evaluations = PeriodicBox(decomposition.length), 0.0, 0
         self.resolution: ResolvedVelocity | None = None
         self.neighborhood: Neighborhood | None = None
         self._local: LocalParticles | None = None
         if "resolved" in model.reads:
-            self.resolution = ResolvedVelocity.on_slabs(decomposition, model.flow.scales, skin / 2 + drift, dtype)
+            self.resolution = ResolvedVelocity.on_slabs(decomposition, model.flow.scales, skin / 2, dtype)
         if "pairs" in model.reads:
             self.neighborhood = Neighborhood(decomposition, model.flow.cutoff, skin)
 
@@ -96,20 +93,16 @@ class ParticleDynamics:
 
         With a resolved velocity but no list, particles move if at least one is outside its slab. Integrators call
         `settle` before they evaluate the rates. `others` are further states of the same particles; their rows move with
-        the particles. Returns all states. While a gradient is recorded, no particle changes rank, because the move is
-        not differentiable.
+        the particles. Returns all states. Differentiable, collective also in the backward pass.
         """
         states = [particles, *others]
-        if self.fixed_ranks:
-            return states
         if self.neighborhood is None and (self.resolution is None or self.decomposition.size == 1):
             if self.resolution is not None:
                 farthest_outside(self.decomposition, particles)
             return [replace(particles, position=self.box.wrap(particles.position)), *others]
-        recorded = torch.is_grad_enabled() and any(column.requires_grad for column in particles.columns().values())
         away = (self.neighborhood.outdated(particles) if self.neighborhood is not None
                 else farthest_outside(self.decomposition, particles) > 0)
-        if recorded or not away:
+        if not away:
             return states
 
         def label(number: int, name: str) -> str:

@@ -1,4 +1,5 @@
-"""Tensors over all ranks: ghost particles, sums and means, which are differentiable, and norms, which are not."""
+"""Tensors over all ranks: ghost particles, changes of rank, sums and means, which are differentiable, and norms, which
+are not."""
 
 from __future__ import annotations
 
@@ -8,6 +9,7 @@ from torch import Tensor
 
 from eddies.parallel.communicator import Comm
 from eddies.parallel.halo import HaloExchange
+from eddies.parallel.migration import Redistribution
 from eddies.parallel.reduction import global_max, global_sum
 from eddies.particles.particle_set import as_numpy
 
@@ -41,6 +43,25 @@ def with_ghosts(halo: HaloExchange, owned: Tensor, positions: bool = False) -> T
     if halo.decomposition.size == 1:
         return owned
     return torch.cat([owned, _GhostExchange.apply(owned, halo, positions)])
+
+
+class _ChangeOfRank(torch.autograd.Function):
+    """Move rows to other ranks. The backward pass sends the rows of the gradient back."""
+
+    @staticmethod
+    def forward(ctx, rows: Tensor, order: Redistribution) -> Tensor:
+        ctx.order = order
+        return torch.from_numpy(order.apply(as_numpy(rows))).to(rows.device)
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:
+        return torch.from_numpy(ctx.order.adjoint(as_numpy(gradient))).to(gradient.device), None
+
+
+def redistributed(order: Redistribution, rows: Tensor) -> Tensor:
+    """Rows (m, ...) of a column (n, ...) that belong to this rank in another order; differentiable, collective also in
+    the backward pass."""
+    return _ChangeOfRank.apply(rows, order)
 
 
 class _GlobalSum(torch.autograd.Function):

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from eddies.parallel.broadcast import first_complaint
 from eddies.parallel.halo import HaloError, HaloExchange, require_thick_slabs
-from eddies.parallel.migration import migrate
+from eddies.parallel.migration import Migration
 from eddies.parallel.reduction import any_rank, global_max
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.exchanges import with_ghosts
+from eddies.particles.exchanges import redistributed, with_ghosts
 from eddies.particles.faults import find_unplaced
 from eddies.particles.kriging import Kriging
 from eddies.particles.neighbor_list import NeighborList
@@ -156,16 +156,19 @@ def farthest_outside(slab: SlabDecomposition, particles: ParticleSet) -> float:
 
 
 def at_home(decomposition: SlabDecomposition, columns: dict[str, Tensor], reach: float) -> dict[str, Tensor]:
-    """Move each particle to the rank of its slab and sort a rank's particles by cell, then by id; collective.
+    """Move each particle to the rank of its slab and sort a rank's particles by cell, then by id.
 
-    Cells have a side of about `reach`, so neighbours are close in memory. The order depends on ids and positions alone.
+    `columns` holds at least `id` (n,) and `position` (n, 3); positions are wrapped into the box first. Cells have a
+    side of about `reach`, so neighbours are close in memory. The order depends on ids and positions alone.
+    Differentiable, collective also in the backward pass.
     """
-    device = columns["id"].device
-    moved = migrate(decomposition, {name: as_numpy(column) for name, column in columns.items()})
-    ids = moved["id"]
+    columns = {**columns, "position": PeriodicBox(decomposition.length).wrap(columns["position"])}
+    position = as_numpy(columns["position"])
+    migration = Migration(decomposition, as_numpy(columns["id"]), position)
+    ids, position = migration.ids, migration.apply(position)
     numbers = int(ids.max(initial=0)) + 1
     # The number of cells is limited so that cell and id fit one integer: one sort key is much faster than four.
     cells = max(min(int(decomposition.length / reach), int((2**63 / numbers) ** (1 / 3)) - 1), 1)
-    x, y, z = np.minimum((moved["position"].T * (cells / decomposition.length)).astype(np.int64), cells - 1)
-    order = np.argsort(((z * cells + y) * cells + x) * numbers + ids)
-    return {name: torch.from_numpy(np.take(column, order, axis=0)).to(device) for name, column in moved.items()}
+    x, y, z = np.minimum((position.T * (cells / decomposition.length)).astype(np.int64), cells - 1)
+    migration.arrange(np.argsort(((z * cells + y) * cells + x) * numbers + ids))
+    return {name: redistributed(migration, column) for name, column in columns.items()}

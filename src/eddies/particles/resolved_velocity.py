@@ -19,7 +19,7 @@ from eddies.particles.exchanges import mean_over_ranks, sum_over_ranks
 from eddies.particles.flow_units import ReferenceScales, resolved_shells
 from eddies.particles.fourier_grid import FourierGrid, Points
 from eddies.particles.least_squares import LeastSquares, Solution
-from eddies.particles.neighborhood import farthest_outside
+from eddies.particles.neighborhood import at_home, farthest_outside
 from eddies.particles.particle_set import ParticleSet
 from eddies.spectral.interpolation import margin_for
 from eddies.spectral.mode_operators import gaussian_transfer
@@ -236,9 +236,11 @@ class ResolvedVelocity:
     def band_energies(self, particles: ParticleSet, near: Tensor | None = None) -> Tensor:
         """Return the kinetic energy <u.u>/2 of each band of `BAND` wavenumber shells from shell 1 on: (bands,).
 
-        `near` is as in `of`. Collective, differentiable.
+        The particles may be on any rank. `near` is as in `of`. Collective, differentiable.
         """
-        spectrum = self.of(particles, near=near).spectrum[1:]
+        slab = self.grid.decomposition
+        moved = ParticleSet(**at_home(slab, particles.columns(), slab.spacing))
+        spectrum = self.of(moved, near=near).spectrum[1:]
         return torch.nn.functional.pad(spectrum, (0, -len(spectrum) % BAND)).view(-1, BAND).sum(1)
 
     # ---- predictions for the next evaluation

@@ -204,13 +204,13 @@ def _limits(scene: Scene, measured: Measured) -> Iterator[tuple[str, int]]:
     if "train" in scene.stages:
         # The a-priori test interpolates filtered fields to the particles.
         yield "ghost planes of the filtered fields", spline_ranks(tracers.cells, "quintic")
-        scales, training = estimate(scene, measured).scales, scene.own_training
-        yield from _of_training(scene, tracers, scales["velocity_rms"] if scales else 0.0)
+        training = scene.own_training
+        yield from _of_training(scene, tracers)
         for name, path in zip(training.truths or (), training.truth_files) if training else ():
             found, forced = product_attributes(path, "reference"), bool(product_attributes(path, "forcing"))
             if "spacing" in found:  # there may be another number of particles
                 other = tracers.with_count(round((BOX_LENGTH / found["spacing"]) ** 3))
-                for reason, ranks in _of_training(scene, other, found["velocity_rms"], forced):
+                for reason, ranks in _of_training(scene, other, forced):
                     yield f"[training] truths: {quoted(name)}: {reason}", ranks
     if scene.coarse_cells:
         # In one step a particle crosses at most as many cells as the Courant number.
@@ -227,26 +227,18 @@ def _limits(scene: Scene, measured: Measured) -> Iterator[tuple[str, int]]:
             yield _of_the_grid(tracers, skin / 2)
 
 
-def _of_training(scene: Scene, tracers: Tracers, velocity: float, forced: bool = False) -> Iterator[tuple[str, int]]:
-    """Yield the limits of the training on a ground truth with such tracers. `velocity` is the rms of a component."""
-    resolved, pairs = scene.needs_resolved_velocity or forced, "pairs" in scene.model.reads
-    horizons, radius = scene.own_training and scene.own_training.horizons, tracers.radius_of(scene.neighbors)
-    if pairs:
-        yield _of_the_reach(tracers, radius)
-    if resolved:
+def _of_training(scene: Scene, tracers: Tracers, forced: bool = False) -> Iterator[tuple[str, int]]:
+    """Yield the limits of the training on a ground truth with such tracers."""
+    horizons = scene.own_training and scene.own_training.horizons
+    if "pairs" in scene.model.reads:
+        yield _of_the_reach(tracers, tracers.radius_of(scene.neighbors))
+    if scene.needs_resolved_velocity or forced or horizons and horizons.energy_weight > 0:
         yield _of_the_grid(tracers, 0.0)
-    if horizons:
-        from eddies.learning.rollout_training import allowed_drift, expected_reach  # imports torch
-        time, when = max(horizons.frames) * tracers.frame_interval, " in the training through horizons"
-        if pairs:
-            yield _of_the_reach(tracers, expected_reach(radius, velocity, time), when)
-        if resolved or horizons.energy_weight > 0:
-            yield f"ghost planes of the grid{when}", _of_the_grid(tracers, allowed_drift(velocity, time))[1]
 
 
-def _of_the_reach(tracers: Tracers, reach: float, when: str = "") -> tuple[str, int]:
+def _of_the_reach(tracers: Tracers, reach: float) -> tuple[str, int]:
     """Return the limit of particles that interact within the range `reach`."""
-    return (f"slabs, at least as thick as the particles' reach {reach:.3g}{when}",
+    return (f"slabs, at least as thick as the particles' reach {reach:.3g}",
             thick_slabs(tracers.planes, BOX_LENGTH, reach))
 
 

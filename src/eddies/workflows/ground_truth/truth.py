@@ -84,13 +84,13 @@ class GroundTruth:
         return migrate(self.decomposition, columns)
 
     def window(self, frame: int, length: int) -> dict[str, np.ndarray]:
-        """Return the columns of `particles` at a frame, and values of the same particles in the next `length` frames:
-        `position_later` and `velocity_later` (n, length, 3), `density_later` (n, length)."""
+        """Return the columns of a frame, and values of the same particles in the next `length` frames: `position_later`
+        and `velocity_later` (n, length, 3), `density_later` (n, length). They are those of this rank's block of ids."""
         columns = self.block(frame)
         later = [self.block(frame + number) for number in range(1, length + 1)]
         for name in ("position", *self._evolving):
             columns[f"{name}_later"] = np.stack([block[name] for block in later], axis=1)
-        return migrate(self.decomposition, columns)
+        return columns
 
     def planes(self, series: FieldSeries, index: int, variable: str, slab: SlabDecomposition) -> np.ndarray:
         """Return a variable on the planes of a slab, (components, z_local, y, x), in double precision.

@@ -14,7 +14,8 @@ from torch import Tensor
 from eddies.analysis.lagrangian import evenly
 from eddies.clock import ProgressLine
 from eddies.learning.force_training import FieldLater, ForceTrainer, LossWeights, TrainingFrame
-from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow, allowed_drift
+from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow
+from eddies.parallel.migration import migrate
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.integrators import INTEGRATORS
@@ -83,11 +84,10 @@ class TrainingData:
         """Return the trainer on windows of frames, and the window for validation; collective."""
         settings, slab = self.settings.horizons, self.truth.decomposition
         interval = self.definition.tracers.frame_interval
-        drift = allowed_drift(self.model.flow.scales.velocity, self.longest * interval)
-        dynamics = ParticleDynamics(slab, self.model, 0.0, self.dtype, fixed_ranks=True, drift=drift)
+        dynamics = ParticleDynamics(slab, self.model, 0.0, self.dtype)
         resolution = dynamics.resolution
         if resolution is None and settings.energy_weight > 0:
-            resolution = ResolvedVelocity.on_slabs(slab, self.model.flow.scales, drift, self.dtype)
+            resolution = ResolvedVelocity.on_slabs(slab, self.model.flow.scales, dtype=self.dtype)
         if resolution is not None:
             # Gradients neglect that the predicted start of a solve depends on earlier states. Therefore the start must
             # not affect the solution, and the tolerance is the usual one.
@@ -107,7 +107,7 @@ class TrainingData:
         later = {name: torch.from_numpy(columns[f"{name}_later"]).to(device).movedim(1, 0).contiguous()
                  for name in ("position", "velocity", "density") if f"{name}_later" in columns}
         particles = particles_for(self.model, columns, device)
-        # In the frame that moves with the mean velocity, particles stay near their slab.
+        # Relative to the mean velocity, single precision holds the fluctuations of a fast flow, too.
         mean = mean_over_ranks(self.truth.decomposition.comm, particles.velocity)
         elapsed = torch.from_numpy(np.diff(self.truth.times[start:start + self.longest + 1]).cumsum()).to(mean)
         particles = replace(particles, velocity=particles.velocity - mean)
@@ -176,7 +176,7 @@ def _field_after(truth: GroundTruth, frame: int, dtype: torch.dtype) -> FieldLat
     """Return the filtered field one frame after `frame`, with the positions and velocities of the particles at that
     time. Both velocities are relative to the mean over the particles."""
     slab, device = truth.decomposition, truth.device
-    columns = truth.window(frame, 1)  # rows as in `particles_with_rates`
+    columns = migrate(slab, truth.window(frame, 1))  # rows as in `particles_with_rates`
     position, later = (torch.from_numpy(columns[name]) for name in ("position", "position_later"))
     # Stored positions are wrapped into the box; `moved` continues from the positions of the frame.
     moved = position + PeriodicBox(slab.length).displacement(later[:, 0], position)
