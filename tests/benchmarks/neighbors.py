@@ -18,7 +18,7 @@ import torch
 import vesin
 from step import in_turn
 
-from eddies.particles.neighbor_list import NeighborList
+from eddies.particles.neighborhood import NeighborList
 from eddies.particles.periodic_box import PeriodicBox
 
 LENGTH = 2 * math.pi

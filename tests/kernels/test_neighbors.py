@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from eddies.particles.neighbor_list import NeighborList
+from eddies.particles.neighborhood import NeighborList
 from eddies.particles.periodic_box import PeriodicBox
 from tests.particles.configurations import CONFIGURATIONS, LENGTH, positions
 
@@ -46,7 +46,7 @@ def test_neighbours_are_those_of_plain_distances(library, monkeypatch, kind, rad
             for dtype in (torch.float64, torch.float32):
                 pairs = neighbors.pairs(moved, senders, kept, dtype)
                 with monkeypatch.context() as other:
-                    other.setattr("eddies.particles.neighbor_list.kernels_serve", lambda device: False)
+                    other.setattr("eddies.particles.neighborhood.kernels_serve", lambda device: False)
                     expected = neighbors.pairs(moved, senders, kept, dtype)
                 assert pairs.count == expected.count
                 for name in ("receiver", "segment", "sender"):

@@ -7,8 +7,7 @@ import torch
 
 from eddies.flow.tracers import release
 from eddies.learning.force_training import FieldLater, ForceTrainer, LossWeights, TrainingFrame
-from eddies.learning.optimization import Adam
-from eddies.learning.training import Phase, Training, TrainingDiverged
+from eddies.learning.training import Adam, Phase, Training, TrainingDiverged
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics

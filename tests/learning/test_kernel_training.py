@@ -4,7 +4,7 @@ import torch
 
 from eddies.flow.tracers import release
 from eddies.learning.kernel_training import KernelSample, KernelTrainer
-from eddies.learning.optimization import Adam
+from eddies.learning.training import Adam
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_field import ParticleField, grid_points
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, integral

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from eddies.learning.losses import kullback_leibler, mean_square_share, soft_histogram
-from eddies.learning.optimization import Adam
+from eddies.learning.training import Adam
 
 
 def my_share(comm, whole):

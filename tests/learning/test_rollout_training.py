@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from eddies.flow.tracers import release
-from eddies.learning.optimization import shared_values
+from eddies.learning.training import shared_values
 from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow, energy_units
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_max

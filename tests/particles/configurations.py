@@ -12,7 +12,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.particles.model import FORCING, LagrangianModel, build_model
-from eddies.particles.neighbor_list import NeighborList
+from eddies.particles.neighborhood import NeighborList
 from eddies.particles.pairs import ScaledPairs
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox

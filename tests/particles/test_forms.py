@@ -7,8 +7,7 @@ import torch
 from eddies.flow.tracers import release
 from eddies.parallel.reduction import global_max
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.forms import Form
-from eddies.particles.particle_field import ParticleField
+from eddies.particles.particle_field import Form, ParticleField
 from eddies.particles.smoothing_kernels import CubicSpline, HermiteKernel, WendlandC2
 from tests.kernels.reference_kriging import solved
 

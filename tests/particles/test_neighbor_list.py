@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from eddies.particles.neighbor_list import NeighborList
+from eddies.particles.neighborhood import NeighborList
 from eddies.particles.periodic_box import PeriodicBox
 from tests.particles.configurations import LENGTH, positions
 

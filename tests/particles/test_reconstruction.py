@@ -1,9 +1,9 @@
 import pytest
 import torch
 
-from eddies.particles.neighbor_list import NeighborList
+from eddies.particles.neighborhood import NeighborList
 from eddies.particles.periodic_box import PeriodicBox
-from eddies.particles.reconstruction import reconstruct_with_gradient, volumes
+from eddies.particles.particle_field import reconstruct_with_gradient, volumes
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, WendlandC2
 from tests.particles.configurations import LENGTH, positions
 

@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from eddies.clock import Clock
 from eddies.flow import initial_fields
-from eddies.flow.courant import CourantLimit
+from eddies.flow.stability import CourantLimit
 from eddies.flow.navier_stokes import IncompressibleFluid
 from eddies.flow.statistics import incompressible_budget
 from eddies.time_stepping import ETDRK4

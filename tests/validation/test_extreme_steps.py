@@ -8,8 +8,7 @@ import torch
 from extreme_cases import PLANES, SKIN, acceleration, random_points, set_up, units
 from mpi4py import MPI
 
-from eddies.particles import moments
-from eddies.particles.context import REGULARISATION
+from eddies.particles.context import REGULARISATION, expected_moment
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.integrators import INTEGRATORS
 from eddies.scene.integrators import SCHEMES
@@ -87,7 +86,7 @@ def wavenumbers_seen(model, side, waves):
     offsets = np.argwhere(np.ones((2 * reach + 1,) * 3)) - reach
     x = offsets[np.any(offsets, axis=1)] * LENGTH / side
     weight = np.clip(1 - np.sum(x**2, axis=1) / model.flow.cutoff**2, 0, None) ** 2
-    kept = REGULARISATION * moments.expected_moment(model.flow.neighbors, model.flow.cutoff)
+    kept = REGULARISATION * expected_moment(model.flow.neighbors, model.flow.cutoff)
     moved = x[:, 0] * np.sin(waves * x[:, 0])
     slope = np.sum(weight * moved) / (np.sum(weight * x[:, 0] ** 2) + kept)
     distance = np.linalg.norm(x, axis=1)

@@ -7,10 +7,9 @@ from flows import make_grid, march, turbulence
 from eddies.clock import Clock
 from eddies.errors import UserError
 from eddies.flow import initial_fields
-from eddies.flow.courant import CourantLimit
+from eddies.flow.stability import GROWTH, CourantLimit, FlowDiverged, quadratic_energy
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
-from eddies.flow.stability import GROWTH, FlowDiverged, quadratic_energy
 from eddies.parallel.reduction import global_sum
 from eddies.scene.scene import load_scene
 from eddies.time_stepping import ETDRK4

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand
-from eddies.particles import moments
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.periodic_box import safe_norm
 
@@ -143,7 +142,8 @@ class ScaledPairs:
     @cached_property
     def weight(self) -> Tensor:
         """w = (1 - q^2)^2 (m,), where q is the distance divided by the radius of interaction."""
-        return moments.weight(self.pairs.distance, self.flow.cutoff)
+        q = self.pairs.distance / self.flow.cutoff
+        return torch.clamp(1 - q * q, min=0) ** 2
 
     def invariants(self, names: Sequence[str], symmetric: bool) -> Tensor:
         """Return the inputs `names` of a network for each pair, (features, m), in the order of `scene.terms.INPUTS`.
