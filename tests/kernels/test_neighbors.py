@@ -61,4 +61,6 @@ def test_without_receivers_or_senders(library):
     for receivers, senders in ((some, none), (none, some), (none, none)):
         neighbors = listed(PeriodicBox(LENGTH, False), 1.0, 0.0, receivers, senders, False)
         assert neighbors.offsets.tolist() == [0] * (len(receivers) + 1) and len(neighbors.senders) == 0
-        assert len(neighbors.pairs(receivers, senders).sender) == 0
+        pairs = neighbors.pairs(receivers, senders)
+        assert len(pairs.sender) == 0 and pairs.sum(torch.ones(2, 0)).shape == (2, len(receivers))
+        assert [*neighbors.blocks(10)][-1].stop == len(receivers)
