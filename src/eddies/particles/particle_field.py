@@ -187,21 +187,11 @@ class Form:
 
     def at(self, field: ParticleField, points: Tensor) -> tuple[Tensor, Tensor]:
         """Reconstruct the velocity (k, 3) and its gradient (k, 3, 3) [component, direction] at points (k, 3) of this
-        rank, from the particles of `field`; collective."""
+        rank, from the particles of `field`; collective.
+
+        The average replaces kriging at points that have too many neighbours or singular equations."""
         if self.name == "average":
             return field.averaged(self.kernel, points)
-        return self._kriged(field, points)
-
-    def on_grid(self, field: ParticleField) -> Tensor:
-        """Reconstruct the velocity (m, 3) at this rank's grid points, z slowest, from the particles of `field`;
-        collective."""
-        if self.name == "average":
-            return field.averaged_on_grid(self.kernel)
-        return self.at(field, field.points)[0]
-
-    def _kriged(self, field: ParticleField, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Reconstruct as in `at`, by kriging. The average replaces it at points that have too many neighbours or
-        singular equations."""
         velocity, gradient = field.kriged(self.filter_width, points)
         solved = velocity.isfinite().all(1) & gradient.isfinite().all(2).all(1)
         failed = torch.nonzero(~solved).squeeze(1)
@@ -211,6 +201,13 @@ class Form:
                         "kriging there", count, total)
             velocity[failed], gradient[failed] = field.averaged(self.kernel, points[failed])
         return velocity, gradient
+
+    def on_grid(self, field: ParticleField) -> Tensor:
+        """Reconstruct the velocity (m, 3) at this rank's grid points, z slowest, from the particles of `field`;
+        collective."""
+        if self.name == "average":
+            return field.averaged_on_grid(self.kernel)
+        return self.at(field, field.points)[0]
 
 
 def grid_points(slab: SlabDecomposition, cells: int) -> Tensor:
