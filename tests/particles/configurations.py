@@ -47,6 +47,7 @@ PAIR_MODELS = {
     "antisymmetric": {"pairs": dict(basis="paper", symmetry="antisymmetric"), "continuity": {},
                       "eddy-viscosity": dict(form="monaghan", basis="paper")},
     "without density": {"pairs": dict(inputs=("distance", "speed", "approach"))},
+    "sph": {**PRESETS["transport-velocity"], "continuity": dict(diffusion=0.1)},
 }
 #: Models with a resolved velocity.
 RESOLVED_MODELS = {
