@@ -4,6 +4,8 @@
     python tests/validation/turbulence.py spectra "hit=runs/hit,runs/hit-2" hit-256=runs/paper-256
     mpirun -n 2 .venv/bin/eddies dns tests/validation/wray.toml
     python tests/validation/turbulence.py decay runs/wray
+    mpirun -n 2 .venv/bin/eddies run cbc
+    python tests/validation/turbulence.py grid runs/cbc [--output docs/validation]
 
 mach: stationary turbulence at several turbulent Mach numbers, each run with its nominal M_t, and its scaling with M_t.
 The scenes have [spin_up] stationary (hit, hit-mt004, hit-mt008, hit-mt016). Writes turbulence.png, too.
@@ -15,6 +17,11 @@ different Reynolds numbers collapse in the dissipation range, from k eta = 0.1 o
 decay: decaying isotropic turbulence beside a direct simulation of 512^3 cells. The run starts from the spectrum of the
 reference at t = 2.977 with random phases. Its transfer of energy needs about one unit of time to recover, so the
 comparison begins at t = 4. The table has energy, enstrophy, skewness and the exponent n of the decay, E ~ (t - t_0)^-n.
+
+grid: decaying grid turbulence beside the experiment of Comte-Bellot and Corrsin. The flows start from the spectrum
+measured at t U0/M = 42. The truth at 98 and 171 is the measured spectrum, filtered as the particles' velocity is. The
+table has, for each variant, the energy up to k_d over that of the filtered experiment and the rms of
+ln(E/E_experiment), means and standard deviations over the realisations. Writes grid-turbulence.png with the spectra.
 """
 
 import argparse
@@ -27,9 +34,13 @@ from mpi4py import MPI
 
 from eddies.analysis.isotropic_turbulence import Row, StationarySpan, comparison
 from eddies.io.hdf5 import open_product, read_table
-from eddies.report.figures import DNS, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled
+from eddies.report.figures import (
+    DNS, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, number_wavenumbers, panels, styled,
+)
 from eddies.report.page import shown
 from eddies.report.stationary import draw_compensated
+from eddies.spectral.mode_operators import gaussian_transfer
+from eddies.stored_run import open_run
 from eddies.workflows.report import read_stationary_span
 
 NOMINAL = (0.04, 0.08, 0.16)  # turbulent Mach numbers of the paper's Table 1
@@ -45,6 +56,14 @@ VISCOSITY, START = 3.5014e-4, 2.977
 TIMES = (3.992, 5.028, 5.719)
 REFERENCE = {"energy": (0.06924, 0.05027, 0.04223), "enstrophy": (70.20, 38.82, 28.40),
              "skewness": (-0.514, -0.515, -0.517)}
+
+# G. Comte-Bellot, S. Corrsin, J. Fluid Mech. 48, 273 (1971), Table 3: k (1/cm) and E (cm^3/s^2) at t U0/M = 98 and 171,
+# behind a grid of mesh M = 5.08 cm in a wind of U0 = 10 m/s.
+WAVENUMBER = (0.11, 0.15, 0.20, 0.25, 0.30, 0.40, 0.50, 0.70, 1.00, 1.50, 2.00, 2.50, 3.00, 4.00)
+ENERGY = {98: (25, 55, 106, 196, 195, 202, 168, 127, 79.2, 47.8, 34.6, 28.6, 23.1, 14.3),
+          171: (20, 49.7, 92.0, 120, 125, 98.0, 81.5, 60.2, 39.4, 24.1, 16.5, 12.5, 9.12, 5.62)}
+LENGTH, SPEED, MESH, WIND = 11 * 5.08 / (2 * np.pi), 22.2, 5.08, 1000.0  # units of the scene; cm and cm/s
+GRID_COLOURS = (MODEL, SECOND, FOURTH, THIRD, DNS)
 
 
 def read(directory: Path, reader):
@@ -197,13 +216,81 @@ def table_of_decay(columns: dict[str, np.ndarray]) -> str:
     return "\n".join(lines)
 
 
+# ---- grid turbulence
+
+
+def filtered_experiment(station: int, shells: np.ndarray, filter_width: float) -> np.ndarray:
+    """E(k) of the filtered experiment in units of the scene."""
+    logarithm = np.interp(np.log(shells), np.log(np.array(WAVENUMBER) * LENGTH), np.log(ENERGY[station]))
+    return np.exp(logarithm) / (SPEED**2 * LENGTH) * gaussian_transfer(shells**2, filter_width) ** 2
+
+
+def time_of(station: int) -> float:
+    """Time since the first station in units of the scene."""
+    return (station - 42) * MESH / WIND / (LENGTH / SPEED)
+
+
+def rollout_spectra(directory: Path, variant: str, realisations: tuple[int, ...], station: int,
+                    shells: np.ndarray) -> np.ndarray:
+    """E(k) (realisations, shells) of the rollouts at the frame nearest to a station."""
+    runs = [open_run(directory / variant / f"realisation-{seed}") for seed in realisations]
+    return np.array([run.spectrum("model", time_of(station)).values[shells.astype(int)] for run in runs])
+
+
+def spread_cell(values: np.ndarray) -> str:
+    """Mean and standard deviation over realisations."""
+    return f"{values.mean():.3f} ± {values.std(ddof=1):.3f}"
+
+
+@styled
+def draw_grid(found: dict[str, dict[int, np.ndarray]], grids: set[str], shells: np.ndarray,
+              filter_width: float) -> Figure:
+    """Mean spectra of all variants at both stations, with the filtered experiment; dashed: those of grids."""
+    figure, axes = panels(1, 2, (4.2, 3.4))
+    order = sorted(found, key=lambda name: name in grids)  # grids last
+    count = len(found) - len(grids)
+    colours = dict(zip(order, [*GRID_COLOURS[:count], *GRID_COLOURS[:len(grids)]]))
+    for axis, station in zip(axes.flat, ENERGY):
+        axis.loglog(shells, filtered_experiment(station, shells, filter_width), "o", color=TRUTH, label="experiment")
+        for name in order:
+            axis.loglog(shells, found[name][station].mean(0), "--" if name in grids else "-", color=colours[name],
+                        label=name)
+        axis.set(title=f"$t U_0/M = {station}$", xlabel="$k$", ylabel="$E(k)$")
+        number_wavenumbers(axis)
+    axes.flat[0].legend(fontsize=7)
+    letter(axes.flat)
+    return figure
+
+
+def compare_with_grid_turbulence(run: Path, output: Path) -> None:
+    """Print the table and draw the spectra of a run of the scene `cbc`."""
+    scene = open_run(run).scene
+    filter_width = scene.tracers.filter_width
+    shells = np.arange(1.0, np.pi / filter_width + 0.5)
+    found = {name: {station: rollout_spectra(run, name, scene.realisations, station, shells) for station in ENERGY}
+             for name in scene.variant}
+    print("| | energy at 98 | rms of logarithms at 98 | energy at 171 | rms at 171 |\n|---|---|---|---|---|")
+    for name, of_stations in found.items():
+        cells = []
+        for station, spectrum in of_stations.items():
+            truth = filtered_experiment(station, shells, filter_width)
+            rms = np.sqrt(np.mean(np.log(spectrum / truth) ** 2, axis=1))
+            cells += [spread_cell(spectrum.sum(1) / truth.sum()), spread_cell(rms)]
+        print(f"| `{name}` | {' | '.join(cells)} |")
+    grids = {name for name, variant in scene.variant.items() if variant.simulation.on_grid}
+    draw_grid(found, grids, shells, filter_width).savefig(output / "grid-turbulence.png", dpi=100, facecolor="white")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("mach", "spectra", "decay"))
+    parser.add_argument("what", choices=("mach", "spectra", "decay", "grid"))
     parser.add_argument("runs", nargs="+", metavar="RUN", help="RUN=M_T, NAME=RUN,RUN or a run directory")
     parser.add_argument("--output", default=Path("runs/validation"), type=Path, metavar="DIR")
     options = parser.parse_args()
-    if options.what == "decay":
+    options.output.mkdir(parents=True, exist_ok=True)
+    if options.what == "grid":
+        compare_with_grid_turbulence(Path(options.runs[0]), options.output)
+    elif options.what == "decay":
         print(table_of_decay(read(Path(options.runs[0]), lambda file: read_table(file, "statistics"))))
     elif options.what == "spectra":
         groups = dict(argument.split("=", 1) for argument in options.runs)
@@ -211,7 +298,6 @@ def main() -> None:
                                 for name, paths in groups.items()}))
     else:
         runs = [Run(directory) for directory in options.runs]
-        options.output.mkdir(parents=True, exist_ok=True)
         draw(runs).savefig(options.output / "turbulence.png", dpi=100, facecolor="white")
         print(table_of_runs(runs))
         if len({run.nominal for run in runs}) > 1:
