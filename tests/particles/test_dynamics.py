@@ -146,6 +146,16 @@ def test_terms_read_the_density_that_others_give(comm, stored):
     assert_close(by_id(comm, particles, rates.density, 200), sine)
 
 
+@pytest.mark.mpi(2)
+@pytest.mark.parametrize("name", ["corrected", "resolved"])
+def test_computations_in_single_precision_differ_by_their_rounding(comm, name):
+    """The parameters are the same."""
+    (slab, particles), force = distributed(comm, *state()), model(MODELS[name]).float()
+    single, double = (dynamics_of(slab, force, iterations=ITERATIONS, dtype=dtype).rates(particles).acceleration
+                      for dtype in (torch.float32, torch.float64))
+    assert single.dtype == torch.float64 and 0 < (single - double).norm() < 1e-5 * double.norm()
+
+
 @pytest.mark.mpi(1, 2)
 def test_settled_particles_stay_until_one_moves_too_far(comm):
     slab, particles = distributed(comm, *state())
