@@ -10,7 +10,7 @@ import pytest
 from eddies import clock
 from eddies.analysis.rollout import same_times
 from eddies.clock import Clock, ProgressLine
-from eddies.flow.courant import FixedStep
+from eddies.flow.stability import FixedStep
 
 UNITS = [1e-15, 1e-6, 1.0, 1e6, 1e15]
 

@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
 
-from eddies.analysis.errors import fluctuations, normalized_l2, rms_log_ratio, velocity_error
+from eddies.analysis.errors import (
+    band_ratios, fluctuations, normalized_l2, rms_log_ratio, spectrum_error, velocity_error,
+)
 
 
 def test_normalized_l2():
@@ -31,3 +33,23 @@ def test_rms_log_ratio_counts_a_factor_alike_both_ways():
     assert rms_log_ratio(truth * np.exp([0.3, -0.3, 0.3]), truth) == pytest.approx(0.3)
     assert rms_log_ratio(truth * [0, 1, 1], truth) == np.inf
     assert np.isnan(rms_log_ratio(np.empty(0), np.empty(0)))
+
+
+def test_a_factor_in_every_shell_is_an_error_of_its_logarithm():
+    reference = np.array([9.0, 3.0, 0.4, 1e-3, 1e-5, 1e-8])
+    for factor in (0.2, -0.2):
+        assert spectrum_error(reference * np.exp(factor), reference, 4.7) == pytest.approx(0.2)
+    # One of the shells 1 to 3 is wrong by a factor e^3.
+    energy = reference * [5, 1, 1, np.exp(3), 0, 7]
+    assert spectrum_error(energy, reference, 3.9) == pytest.approx(3 / np.sqrt(3))
+    assert spectrum_error(energy, reference, 0.5) == 0 and spectrum_error(energy, reference, 4) == np.inf
+
+
+def test_bands_double_and_the_last_ends_at_the_largest_wavenumber():
+    reference = 1 / np.arange(1, 40.0) ** 2
+    energy = reference * np.where(np.arange(39) < 9, 1.0, 2.0)
+    found = band_ratios(energy, reference, 20.3)
+    assert list(found) == ["1-2", "3-4", "5-8", "9-16", "17-20"]
+    assert list(found.values()) == pytest.approx([1, 1, 1, 2, 2])
+    assert list(band_ratios(energy, reference, 5.0)) == ["1-2", "3-4", "5"]
+    assert list(band_ratios(energy, reference, 0.7)) == ["1"]

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from eddies.analysis.velocity_gradients import (
-    ConditionalVelocity, InvariantBins, Invariants, enstrophy_scale, invariants, vieillefosse_line,
+    ConditionalVelocity, InvariantBins, Invariants, enstrophy_scale, invariants, vieillefosse_line, vorticity,
 )
 
 
@@ -82,3 +82,11 @@ def test_cells_with_few_particles_are_nan():
     flow.add(still, still, 0.1, 1.0)
     assert np.isfinite(flow.mean(at_least=3)[0]).sum() == 1
     assert np.isfinite(flow.mean(at_least=4)[0]).sum() == 0
+
+
+@pytest.mark.parametrize("cells", [9, 12])
+def test_vorticity_of_an_abc_flow_is_its_velocity(cells):
+    z, y, x = 2 * np.pi / cells * np.indices((cells,) * 3)
+    a, b, c = 1.0, 0.8, 0.6
+    flow = np.stack([a * np.sin(z) + c * np.cos(y), b * np.sin(x) + a * np.cos(z), c * np.sin(y) + b * np.cos(x)])
+    assert np.allclose(vorticity(flow), flow, atol=1e-13)

@@ -4,7 +4,7 @@ import numpy as np
 
 from eddies.kernels.kriging import MOST_NEIGHBORS
 from eddies.particles.kriging import NOISE, covariance
-from eddies.particles.moments import ENTRIES
+from eddies.particles.context import ENTRIES
 
 
 def solved(offsets, displacement, support, filter_width, sited=True):

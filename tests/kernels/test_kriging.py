@@ -6,7 +6,7 @@ import torch
 
 from eddies.kernels.kriging import MOST_NEIGHBORS, kriging_weights, weighted_sums
 from eddies.particles.kriging import NOISE, covariance
-from eddies.particles.neighbor_list import NeighborList
+from eddies.particles.neighborhood import NeighborList
 from eddies.particles.periodic_box import PeriodicBox
 from tests.kernels.reference_kriging import solved
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from eddies.particles.neighbor_list import NeighborList
+from eddies.particles.neighborhood import NeighborList
 from eddies.particles.periodic_box import PeriodicBox
 from tests.particles.configurations import CONFIGURATIONS, LENGTH, positions
 
@@ -46,7 +46,7 @@ def test_neighbours_are_those_of_plain_distances(library, monkeypatch, kind, rad
             for dtype in (torch.float64, torch.float32):
                 pairs = neighbors.pairs(moved, senders, kept, dtype)
                 with monkeypatch.context() as other:
-                    other.setattr("eddies.particles.neighbor_list.kernels_serve", lambda device: False)
+                    other.setattr("eddies.particles.neighborhood.kernels_serve", lambda device: False)
                     expected = neighbors.pairs(moved, senders, kept, dtype)
                 assert pairs.count == expected.count
                 for name in ("receiver", "segment", "sender"):
@@ -61,4 +61,6 @@ def test_without_receivers_or_senders(library):
     for receivers, senders in ((some, none), (none, some), (none, none)):
         neighbors = listed(PeriodicBox(LENGTH, False), 1.0, 0.0, receivers, senders, False)
         assert neighbors.offsets.tolist() == [0] * (len(receivers) + 1) and len(neighbors.senders) == 0
-        assert len(neighbors.pairs(receivers, senders).sender) == 0
+        pairs = neighbors.pairs(receivers, senders)
+        assert len(pairs.sender) == 0 and pairs.sum(torch.ones(2, 0)).shape == (2, len(receivers))
+        assert [*neighbors.blocks(10)][-1].stop == len(receivers)

@@ -96,8 +96,9 @@ def test_single_precision_differs_by_its_rounding(comm, library, monkeypatch, na
 
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("name", TERMS)
-def test_gradients_are_those_of_differences(comm, library, name):
-    """Gradients by positions, velocities, scalars and parameters, for every summand that has them."""
+def test_gradients_are_those_of_differences(comm, name):
+    """Gradients by positions, velocities, scalars and parameters, for every summand that has them. The test above
+    compares all instruction sets."""
     dynamics, particles = set_up(TERMS[name], "cluster across a corner", count=14)
     for summand, term in summands_of(dynamics, particles):
         parameters = torch.empty(0, dtype=torch.float64) if summand.parameters is None else summand.parameters

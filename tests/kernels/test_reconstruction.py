@@ -7,8 +7,7 @@ import torch
 from eddies.flow.tracers import release
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.exchanges import with_ghosts
-from eddies.particles.particle_field import ParticleField
-from eddies.particles.reconstruction import reconstruct_with_gradient
+from eddies.particles.particle_field import ParticleField, reconstruct_with_gradient
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, WendlandC2
 
 LENGTH = 2 * np.pi

@@ -4,11 +4,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
+from mpi4py import MPI
 
 from eddies.flow.tracers import release
 from eddies.learning.force_training import FieldLater, ForceTrainer, LossWeights, TrainingFrame
-from eddies.learning.optimization import Adam
-from eddies.learning.training import Phase, Training, TrainingDiverged
+from eddies.learning.training import Adam, Phase, Training, TrainingDiverged
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
@@ -102,12 +102,12 @@ def fitted(trainer, steps, rates, kind="trajectory_step"):
 
 
 @pytest.mark.mpi(3)
-@pytest.mark.parametrize("preset", [OWN_DENSITY, "resolved + pairs"])
+@pytest.mark.parametrize("preset", [OWN_DENSITY, "resolved + pairs", None], ids=["pairs", "resolved", "beside a flow"])
 def test_training_is_the_same_on_any_number_of_ranks(comm, preset):
-    from mpi4py import MPI
-
+    """Beside a filtered field of the flow, particles leave their slabs until the time of the field."""
     def losses_and_weights(communicator):
-        trainer = trainer_of(communicator, preset)
+        trainer = trainer_of(communicator, preset) if preset else beside_a_flow(
+            communicator, 0.1, (0.1, 0.0, 0.0), lambda position: position.sin())
         rows = [row for kind in ("trajectory_step", "combined_step") for row in fitted(trainer, 3, (1e-2, 1e-3), kind)]
         rows.append({"error": trainer.combined_error(trainer.frames[0], draws=3)})
         assert rows[-1]["error"] == trainer.combined_error(trainer.frames[0], draws=3)
@@ -302,16 +302,3 @@ def test_a_uniform_filtered_field(comm):
     found = field_loss(replace(later, field=later.field + offset))[0]
     expected = float(offset.square().sum()) / 3 / SPAN**2 / frame.acceleration_rms**2
     assert found["field_loss"] == pytest.approx(expected, rel=1e-9)
-
-
-@pytest.mark.mpi(3)
-def test_the_loss_of_a_filtered_field_is_the_same_on_any_number_of_ranks(comm):
-    """Particles leave their slabs until the time of the field."""
-    from mpi4py import MPI
-
-    def row_of(communicator):
-        return row_and_gradient(beside_a_flow(communicator, 0.1, (0.1, 0.0, 0.0), lambda position: position.sin()))
-
-    (row, gradient), (alone, expected) = row_of(comm), row_of(MPI.COMM_SELF)
-    assert row == pytest.approx(alone, rel=1e-9)
-    assert np.allclose(gradient, expected, rtol=1e-8, atol=1e-11)

@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
 import torch
+from mpi4py import MPI
 
 from eddies.flow.tracers import release
 from eddies.learning.kernel_training import KernelSample, KernelTrainer
-from eddies.learning.optimization import Adam
+from eddies.learning.training import Adam
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_field import ParticleField, grid_points
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, integral
@@ -38,8 +39,6 @@ def fit(comm, support=2.4 * SPACING, steps=4, rates=(1e-3, 1e-3)):
 
 @pytest.mark.mpi(3)
 def test_training_is_the_same_on_any_number_of_ranks(comm):
-    from mpi4py import MPI
-
     _, network, losses = fit(comm)
     _, alone, losses_alone = fit(MPI.COMM_SELF)
     for row, other in zip(losses, losses_alone):

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from mpi4py import MPI
 
 from eddies.learning.losses import kullback_leibler, mean_square_share, soft_histogram
-from eddies.learning.optimization import Adam
+from eddies.learning.training import Adam
 
 
 def my_share(comm, whole):
@@ -16,7 +17,6 @@ def my_share(comm, whole):
 
 @pytest.mark.mpi(3)
 def test_histogram_and_gradient_are_those_of_one_rank(comm):
-    from mpi4py import MPI
     values = 2 * np.random.default_rng(2).standard_normal((200, 3))
     truth = torch.full((11,), 1 / 11, dtype=torch.float64)
 
@@ -54,7 +54,6 @@ def test_divergence_of_known_histograms():
 
 @pytest.mark.mpi(2, 3)
 def test_adam_takes_the_same_steps_on_any_number_of_ranks(comm):
-    from mpi4py import MPI
     target = np.random.default_rng(4).standard_normal((60, 2))
 
     def fit(rows, communicator):

@@ -3,9 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from mpi4py import MPI
 
 from eddies.flow.tracers import release
-from eddies.learning.optimization import shared_values
+from eddies.learning.training import shared_values
 from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow, energy_units
 from eddies.parallel.migration import IdOrder
 from eddies.parallel.reduction import global_max
@@ -82,8 +83,6 @@ def gradient_of(comm, horizon, **choices):
 @pytest.mark.parametrize("preset", ["resolved + pairs", OWN_DENSITY])
 @pytest.mark.mpi(2, 3)
 def test_gradient_is_the_same_on_any_number_of_ranks(comm, preset):
-    from mpi4py import MPI
-
     loss, gradient = gradient_of(comm, FRAMES, preset=preset)
     alone, expected = comm.bcast(gradient_of(MPI.COMM_SELF, FRAMES, preset=preset) if comm.rank == 0 else None)
     assert loss == pytest.approx(alone, rel=1e-11)

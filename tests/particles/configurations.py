@@ -12,7 +12,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.particles.model import FORCING, LagrangianModel, build_model
-from eddies.particles.neighbor_list import NeighborList
+from eddies.particles.neighborhood import NeighborList
 from eddies.particles.pairs import ScaledPairs
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
@@ -47,6 +47,7 @@ PAIR_MODELS = {
     "antisymmetric": {"pairs": dict(basis="paper", symmetry="antisymmetric"), "continuity": {},
                       "eddy-viscosity": dict(form="monaghan", basis="paper")},
     "without density": {"pairs": dict(inputs=("distance", "speed", "approach"))},
+    "sph": {**PRESETS["transport-velocity"], "continuity": dict(diffusion=0.1)},
 }
 #: Models with a resolved velocity.
 RESOLVED_MODELS = {

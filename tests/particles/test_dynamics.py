@@ -20,7 +20,7 @@ SKIN = 0.2
 # Iterations of each solve for the resolved velocity, equal on any number of ranks.
 ITERATIONS = 8
 # Every basis, symmetry and kind of density.
-VARIOUS = ("published", "corrected", "antisymmetric", "pairs with density", "resolved")
+VARIOUS = ("published", "corrected", "antisymmetric", "sph", "pairs with density", "resolved")
 various_models = pytest.mark.parametrize("name", VARIOUS)
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from eddies.particles.flow_units import FlowUnits
-from eddies.particles.moments import ENTRIES
+from eddies.particles.context import ENTRIES
 from tests.particles.configurations import LENGTH, SCALES, by_id, distributed, dynamics_of, model, relative
 from tests.validation.filtered_fields import WAVE, at, random_velocity
 

@@ -7,9 +7,10 @@ import torch
 from eddies.parallel.halo import HaloError
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.exchanges import with_ghosts
-from eddies.particles.neighborhood import Neighborhood, at_home
+from eddies.particles.neighborhood import Neighborhood, NeighborList, at_home
 from eddies.particles.particle_set import ParticleSet
-from tests.particles.configurations import LENGTH
+from eddies.particles.periodic_box import PeriodicBox
+from tests.particles.configurations import LENGTH, positions
 
 
 def particles_at(comm, heights):
@@ -78,3 +79,27 @@ def test_particles_settle_in_order_of_cells_and_ids(comm, unit, cells):
     assert np.array_equal(found["id"], ids[here][np.lexsort((ids[here], x, y, z))])
     nothing = at_home(slab, {"id": torch.empty(0, dtype=torch.int64), "position": torch.empty(0, 3)}, 1 / 4)
     assert len(nothing["id"]) == 0
+
+
+# ---- the list alone
+
+
+def test_blocks_cover_all_rows_once_with_about_as_many_pairs():
+    position, neighbors = positions("uneven", 300), NeighborList(PeriodicBox(LENGTH), 0.8, 0.0)
+    neighbors.build(position, position, exclude_self=True)
+    blocks = list(neighbors.blocks(100))
+    assert [row for block in blocks for row in range(block.start, block.stop)] == list(range(300))
+    most = int(neighbors.offsets.diff().max())
+    sizes = [int(neighbors.offsets[block.stop] - neighbors.offsets[block.start]) for block in blocks]
+    assert len(blocks) > 10 and max(sizes) <= 100 + most
+
+
+@pytest.mark.parametrize("cutoff, skin", [(0.0, 0.1), (1.0, -0.1), (3.0, 0.2)])
+def test_impossible_radii_are_refused(cutoff, skin):
+    with pytest.raises(ValueError, match="half the box"):
+        NeighborList(PeriodicBox(LENGTH), cutoff, skin)
+
+
+def test_positions_that_are_not_finite_are_refused():
+    with pytest.raises(ValueError, match="not finite"):
+        NeighborList(PeriodicBox(LENGTH), 1.0, 0.0).build(torch.full((2, 3), torch.nan), torch.zeros(2, 3), True)

@@ -9,7 +9,7 @@ from flows import turbulence
 from eddies.flow.navier_stokes import IncompressibleFluid
 from eddies.learning import force_training
 from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
-from eddies.learning.optimization import Adam
+from eddies.learning.training import Adam
 from eddies.particles.context import Context
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.flow_units import FlowUnits, ReferenceScales

@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from eddies.analysis.accuracy import accuracy
+from eddies.analysis.against_truth import accuracy
 from eddies.flow.initial_fields import random_velocity
 from eddies.io.hdf5 import open_product, read_attributes
 from eddies.io.weights import load_weights

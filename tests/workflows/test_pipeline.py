@@ -13,7 +13,7 @@ import torch
 
 from eddies.io.new_files import python_value
 from eddies.io.weights import load_weights
-from eddies.learning.optimization import shared_values
+from eddies.learning.training import shared_values
 from eddies.scene.model import BUILT_IN_PREFIX, WEIGHTS, built_in_weights
 from eddies.scene.scene import load_scene
 from eddies.stored_run import open_run

@@ -1,4 +1,4 @@
-"""Error norms of predictions against a known truth."""
+"""Errors of predictions and of energy spectra against a known truth."""
 
 import numpy as np
 
@@ -49,3 +49,33 @@ def rms_log_ratio(prediction: np.ndarray, truth: np.ndarray) -> float:
         return np.nan
     with np.errstate(divide="ignore", invalid="ignore"):
         return float(np.sqrt(np.mean(np.log(prediction / truth) ** 2)))
+
+
+def spectrum_error(energy: np.ndarray, reference: np.ndarray, largest_wavenumber: float) -> float:
+    """Return the root mean square of ln(E(k) / E_reference(k)) over the shells 1 <= k <= largest_wavenumber.
+
+    `energy` and `reference` are (shells,), from k = 0 on. The shell k = 1 always counts. If the last shell has
+    k < largest_wavenumber, the mean ends there. The result is not finite if one of these shells has no energy in
+    `energy` or in `reference`.
+    """
+    shells = slice(1, _last_shell(largest_wavenumber, energy) + 1)
+    return rms_log_ratio(energy[shells], reference[shells])
+
+
+def band_ratios(energy: np.ndarray, reference: np.ndarray, largest_wavenumber: float) -> dict[str, float]:
+    """Return, for each of the bands of shells "1-2", "3-4", "5-8", ..., its energy divided by that in `reference`.
+
+    All bands together have the shells of `spectrum_error`, so the last band may be narrower.
+    """
+    last, ratios, first, end = _last_shell(largest_wavenumber, energy), {}, 1, 2
+    while first <= last:
+        end = min(end, last)
+        band = slice(first, end + 1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratios[f"{first}-{end}" if end > first else f"{first}"] = float(energy[band].sum() / reference[band].sum())
+        first, end = end + 1, 2 * end
+    return ratios
+
+
+def _last_shell(largest_wavenumber: float, energy: np.ndarray) -> int:
+    return min(max(int(largest_wavenumber + 1e-9), 1), len(energy) - 1)

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from eddies.analysis.spectra import band_ratios, spectrum_error
+from eddies.analysis.errors import band_ratios, spectrum_error
 from eddies.analysis.velocity_gradients import Invariants
 from eddies.clock import ROUND_OFF, SAME
 

@@ -1,6 +1,6 @@
-"""Invariants Q and R of the velocity gradient tensor, and the mean motion of particles in the Q-R plane.
+"""Invariants Q and R of the velocity gradient tensor, the mean motion of particles in the Q-R plane, and vorticity.
 
-The definitions are the paper's Eqs. 16 and 17.
+The definitions of Q and R are the paper's Eqs. 16 and 17.
 """
 
 from dataclasses import dataclass
@@ -120,3 +120,17 @@ class ConditionalVelocity:
         with np.errstate(invalid="ignore", divide="ignore"):
             means = self.second_rate / self.count, self.third_rate / self.count
         return tuple(np.where(self.count >= at_least, mean, np.nan) for mean in means)
+
+
+def vorticity(velocity: np.ndarray) -> np.ndarray:
+    """Return the vorticity curl u of a velocity u by spectral differentiation: (3, n, n, n) -> (3, n, n, n).
+
+    Components are x, y, z. Derivatives of the Nyquist modes are set to zero, as a real field requires.
+    """
+    cells = velocity.shape[-1]
+    k = np.fft.fftfreq(cells, 1 / cells)
+    k[2 * np.abs(k) == cells] = 0
+    kz, ky, kx = 1j * k[:, None, None], 1j * k[:, None], 1j * np.abs(k[:cells // 2 + 1])
+    u, v, w = (np.fft.rfftn(np.asarray(component, dtype=float)) for component in velocity)
+    curl = (ky * w - kz * v, kz * u - kx * w, kx * v - ky * u)
+    return np.stack([np.fft.irfftn(component, s=(cells,) * 3, axes=(0, 1, 2)) for component in curl])

@@ -11,16 +11,14 @@ import torch
 from torch import Tensor
 
 from eddies.learning.losses import kullback_leibler, mean_square_share, soft_histogram
-from eddies.learning.optimization import Adam, shared_values
+from eddies.learning.training import Adam, shared_values
 from eddies.parallel.reduction import global_sum
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.exchanges import mean_over_ranks, relative_error, root_mean_square, sum_over_ranks
 from eddies.particles.model import LagrangianModel
-from eddies.particles.neighbor_list import NeighborList
-from eddies.particles.neighborhood import LocalParticles, Neighborhood
-from eddies.particles.particle_field import grid_points
+from eddies.particles.neighborhood import LocalParticles, NeighborList, Neighborhood
+from eddies.particles.particle_field import grid_points, reconstruct, volumes
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.reconstruction import reconstruct, volumes
 from eddies.particles.smoothing_kernels import SmoothingKernel
 
 # Histograms of the divergence losses: number of bins, and reach to each side in standard deviations.

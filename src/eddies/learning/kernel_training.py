@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from eddies.learning.losses import mean_square_share
-from eddies.learning.optimization import Adam, shared_values
+from eddies.learning.training import Adam, shared_values
 from eddies.parallel.reduction import global_sum
 from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.particle_field import ParticleField

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from eddies.learning.losses import mean_square_share
-from eddies.learning.optimization import Adam, shared_values
+from eddies.learning.training import Adam, shared_values
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import IdOrder
 from eddies.parallel.reduction import global_sum

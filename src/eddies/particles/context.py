@@ -14,7 +14,6 @@ from torch import Tensor
 from eddies.import_path import users_code
 from eddies.kernels.pairs import PairSpace
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles import moments
 from eddies.particles.devices import kernels_serve
 from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.flow_units import FlowUnits
@@ -32,6 +31,8 @@ PAIR_VALUES_TOGETHER = {"cpu": 1 << 19, "cuda": 1 << 26}
 # This fraction of the values for evenly spread neighbours is added to moment matrices and sums of weights. They can
 # then be inverted even without neighbours or with only coplanar ones. In all other cases the bias is 0.1 %.
 REGULARISATION = 1e-3
+# Indices of the six entries of a symmetric 3 x 3 matrix: xx, xy, xz, yy, yz, zz.
+ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 UNDECLARED = 'the term uses "{}", which no term of this model declares; add it to `reads` of its settings'
 
 
@@ -173,10 +174,10 @@ class Context:
     def moments(self) -> Moments:
         """Moments of the neighbourhoods, regularised so that they can be inverted even without any neighbour."""
         sums, flow = self.pair_sums(_MOMENTS), self.flow
-        expected = moments.expected_moment(flow.neighbors, flow.cutoff / flow.scales.filter_width)
+        expected = expected_moment(flow.neighbors, flow.cutoff / flow.scales.filter_width)
         diagonal = sums.new_tensor([1, 0, 0, 1, 0, 1]).unsqueeze(1)
-        return Moments(moments.invert_symmetric(sums[1:] + REGULARISATION * expected * diagonal),
-                       sums[:1] + REGULARISATION * moments.expected_weight(flow.neighbors))
+        return Moments(invert_symmetric(sums[1:] + REGULARISATION * expected * diagonal),
+                       sums[:1] + REGULARISATION * expected_weight(flow.neighbors))
 
     def sum_pairs(self, terms: Sequence[PairSum]) -> None:
         """Compute and store the sums of several terms together, and the moments if a term needs them; collective."""
@@ -252,10 +253,42 @@ class _SharedMoments(PairSum):
     mutual, parity = True, torch.ones(7)
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
-        return torch.stack([pairs.weight, *moments.products(pairs.weight * pairs.x, pairs.x)])
+        return torch.stack([pairs.weight, *products(pairs.weight * pairs.x, pairs.x)])
 
     def compiled(self, context: Context) -> CompiledSum:
         return CompiledSum("moments", reads_velocity=False)
 
 
 _MOMENTS = _SharedMoments()
+
+
+def expected_weight(neighbors: float) -> float:
+    """Return the sum of w over `neighbors` evenly spread particles within the cutoff. Each adds
+    3 int q^2 w dq = 8/35."""
+    return neighbors * 8 / 35
+
+
+def expected_moment(neighbors: float, cutoff: float) -> float:
+    """Return a diagonal entry of sum w x x^T for evenly spread neighbours. Each adds
+    cutoff^2 int q^4 w dq = 8/315 cutoff^2."""
+    return neighbors * cutoff**2 * 8 / 315
+
+
+def products(a: Tensor, b: Tensor) -> list[Tensor]:
+    """Return the six entries a_i b_j, each (m,), of a b^T for parallel vectors a, b (3, m). So a b^T is symmetric."""
+    return [a[i] * b[j] for i, j in ENTRIES]
+
+
+def invert_symmetric(matrix: Tensor) -> Tensor:
+    """Return the inverses (6, n) of n symmetric positive definite 3 x 3 matrices, given by their six entries (6, n)."""
+    xx, xy, xz, yy, yz, zz = matrix
+    cofactors = torch.stack([yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy, xx * zz - xz * xz,
+                             xy * xz - xx * yz, xx * yy - xy * xy])
+    return cofactors / (xx * cofactors[0] + xy * cofactors[1] + xz * cofactors[2])
+
+
+def apply_symmetric(matrix: Tensor, vectors: Tensor) -> Tensor:
+    """Return the products of symmetric matrices (6, n) with vectors (3, n): (3, n)."""
+    xx, xy, xz, yy, yz, zz = matrix
+    x, y, z = vectors
+    return torch.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z])

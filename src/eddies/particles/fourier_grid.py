@@ -6,6 +6,7 @@ Torch differentiates formulas composed of these maps automatically.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -101,6 +102,15 @@ class FourierGrid(ModeOperators):
         return modes * (1 - self._zeroth)
 
     # ---- formulas on modes
+
+    def mean_square(self, modes: Tensor, above: float = -1.0, below: float = math.inf) -> Tensor:
+        """Return the mean of u.u over space, where u has the given `modes` with `above` < |k| < `below` alone.
+
+        The limits are in units of the smallest wavenumber. Collective, differentiable.
+        """
+        square = (modes.real.square() + modes.imag.square()).sum(0) * self.multiplicity
+        inside = (self.shell > above) & (self.shell < below)
+        return sum_over_ranks(self.decomposition.comm, torch.where(inside, square, 0.0).sum(dtype=torch.float64))
 
     def filter_transfer(self, width: float) -> Tensor:
         """Transfer function G (kz, ky, kx) of the Gaussian filter of this width; see `gaussian_transfer`."""

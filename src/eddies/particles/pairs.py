@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand
-from eddies.particles import moments
 from eddies.particles.flow_units import FlowUnits
+from eddies.particles.particle_set import as_numpy
 from eddies.particles.periodic_box import safe_norm
 
 
@@ -143,7 +143,8 @@ class ScaledPairs:
     @cached_property
     def weight(self) -> Tensor:
         """w = (1 - q^2)^2 (m,), where q is the distance divided by the radius of interaction."""
-        return moments.weight(self.pairs.distance, self.flow.cutoff)
+        q = self.pairs.distance / self.flow.cutoff
+        return torch.clamp(1 - q * q, min=0) ** 2
 
     def invariants(self, names: Sequence[str], symmetric: bool) -> Tensor:
         """Return the inputs `names` of a network for each pair, (features, m), in the order of `scene.terms.INPUTS`.
@@ -214,21 +215,17 @@ class _PairSums(torch.autograd.Function):
     def forward(ctx, space: PairSpace, summands: list[Summand], wanted: np.ndarray, dtype: torch.dtype,
                 position: Tensor, velocity: Tensor, scalars: Tensor, *parameters: Tensor) -> tuple[Tensor, ...]:
         kind = np.dtype(str(dtype).removeprefix("torch."))
-        ctx.pairs = CompiledPairs(space, *map(_numbers, (position, velocity, scalars)), wanted, kind)
+        ctx.pairs = CompiledPairs(space, *map(as_numpy, (position, velocity, scalars)), wanted, kind)
         ctx.summands = summands
         ctx.save_for_backward(position, velocity, scalars, *parameters)
-        return tuple(map(torch.from_numpy, ctx.pairs.sums(summands, list(map(_numbers, parameters)))))
+        return tuple(map(torch.from_numpy, ctx.pairs.sums(summands, list(map(as_numpy, parameters)))))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, *by_sums: Tensor) -> tuple[Tensor | None, ...]:
         inputs = ctx.saved_tensors
-        by_parameters, by_columns = ctx.pairs.gradients(ctx.summands, list(map(_numbers, inputs[3:])),
+        by_parameters, by_columns = ctx.pairs.gradients(ctx.summands, list(map(as_numpy, inputs[3:])),
                                                         [by.numpy() for by in by_sums], any(ctx.needs_input_grad[4:7]))
         gradients = [*(by_columns or (None, None, None)), *by_parameters]
         return (None, None, None, None, *(None if by is None else torch.from_numpy(by).to(tensor)
                                           for by, tensor in zip(gradients, inputs)))
-
-
-def _numbers(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().numpy()

@@ -1,7 +1,9 @@
-"""Particles at one moment as samples of a velocity field: averages and kriging."""
+"""Particles at one moment as samples of a velocity field: averages (Eqs. 5 and 6) and kriging, and their gradients."""
 
 from __future__ import annotations
 
+import logging
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -11,21 +13,25 @@ from torch import Tensor
 from eddies.kernels.pairs import PairSpace
 from eddies.kernels.reconstruction import kernel_numbers, sums_on_grid
 from eddies.parallel.halo import HaloExchange
+from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.exchanges import mean_over_ranks, with_ghosts
 from eddies.particles.kriging import interpolated
-from eddies.particles.neighbor_list import NeighborList
+from eddies.particles.neighborhood import NeighborList
 from eddies.particles.pairs import CompiledSum, Pairs, compiled_sums
 from eddies.particles.particle_set import as_numpy
 from eddies.particles.periodic_box import PeriodicBox
-from eddies.particles.reconstruction import normalisation, reconstruct_with_gradient
-from eddies.particles.smoothing_kernels import HermiteKernel, SmoothingKernel
+from eddies.particles.smoothing_kernels import HermiteKernel, SmoothingKernel, over_distance
 
 # Number of pairs evaluated together where no gradient is recorded. Their values about fill the cache of a core.
 PAIRS_TOGETHER = 1 << 16
 # Number of pairs evaluated together in kriging, which has ten weights per pair. So many pairs belong to enough points
 # to occupy all threads.
 KRIGED_TOGETHER = 1 << 20
+# Methods of reconstruction ("forms").
+WORDS = {"average": "averages with the learned kernel", "kriging": "kriging among neighbours"}
+
+log = logging.getLogger("eddies")
 
 
 class ParticleField:
@@ -156,6 +162,54 @@ class ParticleField:
         return neighbors
 
 
+@dataclass(frozen=True)
+class Form:
+    """A way to reconstruct the velocity from the particles within the support of the kernel.
+
+    Parameters
+    ----------
+    name : "average", Eqs. 5 and 6; or "kriging", the best linear estimate for the covariance of filtered turbulence.
+    kernel : the learned kernel W. Only the form "average" accepts a W with negative values.
+    filter_width : d of the filter that the velocities have passed.
+    """
+
+    name: str
+    kernel: SmoothingKernel
+    filter_width: float
+
+    @property
+    def words(self) -> str:
+        return WORDS[self.name]
+
+    @property
+    def support(self) -> float:
+        return self.kernel.support
+
+    def at(self, field: ParticleField, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Reconstruct the velocity (k, 3) and its gradient (k, 3, 3) [component, direction] at points (k, 3) of this
+        rank, from the particles of `field`; collective.
+
+        The average replaces kriging at points that have too many neighbours or singular equations."""
+        if self.name == "average":
+            return field.averaged(self.kernel, points)
+        velocity, gradient = field.kriged(self.filter_width, points)
+        solved = velocity.isfinite().all(1) & gradient.isfinite().all(2).all(1)
+        failed = torch.nonzero(~solved).squeeze(1)
+        count, total = global_sum(field.decomposition.comm, np.array([len(failed), len(points)]))
+        if count:  # on any rank: averages are collective
+            log.warning("kriging: %d of %d points have too many neighbours or singular equations; averages replace "
+                        "kriging there", count, total)
+            velocity[failed], gradient[failed] = field.averaged(self.kernel, points[failed])
+        return velocity, gradient
+
+    def on_grid(self, field: ParticleField) -> Tensor:
+        """Reconstruct the velocity (m, 3) at this rank's grid points, z slowest, from the particles of `field`;
+        collective."""
+        if self.name == "average":
+            return field.averaged_on_grid(self.kernel)
+        return self.at(field, field.points)[0]
+
+
 def grid_points(slab: SlabDecomposition, cells: int) -> Tensor:
     """Return the points (m, 3) of a grid of `cells`^3 points that lie in this slab, with x fastest and z slowest."""
     axis = torch.arange(cells, dtype=torch.float64) * (slab.length / cells)
@@ -176,3 +230,60 @@ def _table_sums(kernel: HermiteKernel, pairs: Pairs) -> Tensor:
     total = len(kernel.table)
     sums = pairs.distance.new_zeros(pairs.count * total)
     return sums.index_add_(0, (entries + pairs.segment * total).flatten(), factors.flatten()).reshape(-1, total)
+
+
+# ---- kernel averages by torch
+
+
+def volumes(kernel: SmoothingKernel, pairs: Pairs) -> Tensor:
+    """Return the volume 1 / (W(0) + sum_j W(x_i - x_j)) of each particle i, (count,), or the kernel's mean volume.
+
+    `pairs` must not pair a particle with itself: W(0) already counts the particle.
+    """
+    if kernel.mean_volume is not None:
+        return pairs.distance.new_full((pairs.count,), kernel.mean_volume)
+    at_centre = kernel.value(pairs.distance.new_zeros(1))
+    return 1 / (at_centre + pairs.sum(kernel.value(pairs.distance)[None])[0])
+
+
+def reconstruct(kernel: SmoothingKernel, pairs: Pairs, sender_volumes: Tensor, sender_values: Tensor) -> Tensor:
+    """Return <A>(x) = sum_j V_j A_j W(x - x_j) / sum_j V_j W(x - x_j) at the receivers x, (count, components).
+
+    A kernel with a mean volume gives the numerator alone, Eq. 6. The result is zero where no particle lies within the
+    support. The volumes V (s,) and values A (s, components) are those of all local particles. A particle that is a
+    receiver must be among its own neighbours.
+    """
+    return _average(kernel, pairs, pairs.at_senders(sender_volumes), pairs.at_senders(sender_values).T)[0].T
+
+
+def reconstruct_with_gradient(kernel: SmoothingKernel, pairs: Pairs, sender_volumes: Tensor,
+                              sender_values: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the result of `reconstruct`, and its gradient (count, components, 3) with the direction as the last axis.
+
+    The gradient sum_j V_j (A_j - <A>) grad W(x - x_j) / sum_j V_j W is exactly the gradient of the average.
+    """
+    volume, value, distance = pairs.at_senders(sender_volumes), pairs.at_senders(sender_values).T, pairs.distance
+    average, factor = _average(kernel, pairs, volume, value)
+    gradient = volume * over_distance(kernel.derivative(distance), distance) * pairs.displacement.T
+    products = (value - average.index_select(1, pairs.segment)).unsqueeze(1) * gradient
+    sums = pairs.sum(products.flatten(0, 1)) * factor
+    return average.T, sums.unflatten(0, products.shape[:2]).permute(2, 0, 1)
+
+
+def normalisation(kernel: SmoothingKernel, denominator: Tensor) -> Tensor:
+    """Return 1 / denominator, or zero where no particle contributes; 1 for a kernel with a mean volume."""
+    if kernel.mean_volume is not None:
+        return torch.ones_like(denominator)
+    empty = denominator == 0
+    return torch.where(empty, torch.zeros_like(denominator), 1 / torch.where(empty, 1, denominator))
+
+
+def _average(kernel: SmoothingKernel, pairs: Pairs, volume: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the average (components, count) and its `normalisation` (1, count).
+
+    `volume` (m,) and `value` (components, m) are those of the sender of each pair.
+    """
+    weight = volume * kernel.value(pairs.distance)
+    sums = pairs.sum(torch.cat([weight.unsqueeze(0), weight * value]))
+    factor = normalisation(kernel, sums[:1])
+    return sums[1:] * factor, factor

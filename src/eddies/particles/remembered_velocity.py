@@ -122,6 +122,4 @@ class RememberedVelocity:
 
     def _speed(self, modes: Tensor) -> float:
         """Return the rms u' of a component of the velocity with these modes; collective."""
-        grid = self.solver.grid
-        square = grid.multiplicity * (modes.real.square() + modes.imag.square()).sum(0)
-        return math.sqrt(float(global_sum(grid.decomposition.comm, float(square.sum(dtype=torch.float64)))) / 3)
+        return math.sqrt(float(self.solver.grid.mean_square(modes)) / 3)

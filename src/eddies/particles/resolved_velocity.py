@@ -125,18 +125,9 @@ class ResolvedFlow:
         """Root mean square of a velocity component of the modes of u* with |k| > k_c/2; collective, differentiable."""
         return self._rms_of(self.unfiltered, self.grid.resolved / 2)
 
-    def mean_square(self, modes: Tensor, above: float, below: float = math.inf) -> Tensor:
-        """Return the mean of u.u over space, where u has the given `modes` with `above` < |k| < `below` alone.
-
-        The limits are in units of the smallest wavenumber. Collective, differentiable.
-        """
-        square = (modes.real.square() + modes.imag.square()).sum(0) * self.grid.multiplicity
-        inside = (self.grid.shell > above) & (self.grid.shell < below)
-        return sum_over_ranks(self.grid.decomposition.comm, torch.where(inside, square, 0.0).sum(dtype=torch.float64))
-
     def _rms_of(self, modes: Tensor, above: float) -> Tensor:
         # The lower bound makes the derivative of the root zero for a fluid at rest.
-        return (self.mean_square(modes, above) / 3).clamp_min(torch.finfo(torch.float64).tiny).sqrt()
+        return (self.grid.mean_square(modes, above) / 3).clamp_min(torch.finfo(torch.float64).tiny).sqrt()
 
 
 class ResolvedVelocity:

@@ -10,7 +10,7 @@ from eddies.analysis.block_averages import Blocks, Estimate
 from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.pdfs import bin_centres, bin_probabilities, gaussian, kl_divergence, pdf, standardized
 from eddies.analysis.rollout import Frames, Rollout, second_half
-from eddies.analysis.spectra import spectrum_error
+from eddies.analysis.errors import spectrum_error
 from eddies.analysis.velocity_gradients import InvariantBins, Invariants
 from eddies.report.figures import GUIDE, MODEL, TRUTH, letter, number_wavenumbers, panels, styled
 from eddies.report.page import Metric, Section

@@ -24,9 +24,8 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.particles.exchanges import fluctuations, relative_error
-from eddies.particles.forms import Form
+from eddies.particles.particle_field import Form, ParticleField
 from eddies.particles.fourier_grid import FourierGrid
-from eddies.particles.particle_field import ParticleField
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import CubicSpline, SmoothingKernel

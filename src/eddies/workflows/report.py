@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eddies.analysis.isotropic_turbulence import StationarySpan
-from eddies.analysis.spectra import vorticity
+from eddies.analysis.velocity_gradients import vorticity
 from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import File, ProductError, in_files, open_product, read_attributes, read_table

@@ -24,8 +24,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.particles.flow_units import ReferenceScales
-from eddies.particles.forms import Form
-from eddies.particles.particle_field import ParticleField
+from eddies.particles.particle_field import Form, ParticleField
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, SmoothingKernel, WendlandC2, integral
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Kernel, Scene

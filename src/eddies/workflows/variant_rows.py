@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from eddies.analysis.accuracy import accuracy
+from eddies.analysis.against_truth import accuracy
 from eddies.analysis.pareto import break_even
 from eddies.cores import threads
 from eddies.io.hdf5 import open_product

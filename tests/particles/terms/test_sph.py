@@ -12,8 +12,7 @@ from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.smoothing_kernels import CubicSpline
 from eddies.scene.terms import PRESETS
 from tests.particles.configurations import (
-    LENGTH, SCALES, assert_close, by_id, by_torch, distributed, dynamics_of, given, lattice, model, rates, state,
-    summed_density,
+    LENGTH, SCALES, by_id, distributed, dynamics_of, lattice, model, rates, state, summed_density,
 )
 
 SIDE = 10
@@ -23,22 +22,6 @@ FLOW = FlowUnits(replace(SCALES, spacing=SPACING), SPACING * (60 / (4 / 3 * math
 ONES = torch.ones(SIDE**3, dtype=torch.float64)
 REST = torch.zeros(SIDE**3, 3, dtype=torch.float64)
 one_rank = pytest.mark.mpi(1)
-
-
-@pytest.mark.mpi(1, 2, 3)
-def test_rates_do_not_depend_on_ranks(comm, monkeypatch):
-    """Forces and the density equation, with diffusion and a shift; the forces conserve momentum. The compiled sums of
-    all ranks are those of torch on one rank."""
-    columns, force = state(200), model({**PRESETS["transport-velocity"], "continuity": dict(diffusion=0.1)})
-    slab, particles = distributed(comm, *columns)
-    found = dynamics_of(slab, force).rates(particles)
-    by_torch(monkeypatch)
-    expected = rates(force, *columns)
-    assert set(given(expected)) == {"acceleration", "density_rate", "shift_velocity", "shift_acceleration"}
-    for name, column in given(expected).items():
-        assert_close(by_id(comm, particles, getattr(found, name), 200), column.detach(), 1e-11)
-    for column in (expected.acceleration, expected.shift_velocity):
-        assert column.sum(0).abs().max() < 1e-12 * column.abs().sum()
 
 
 # ---- the density equation

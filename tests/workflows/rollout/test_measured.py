@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eddies.analysis.accuracy import accuracy
+from eddies.analysis.against_truth import accuracy
 from eddies.io.hdf5 import ProductError, open_product
 from eddies.io.trajectories import Trajectory
 from eddies.workflows.rollout import particle_measures

@@ -5,7 +5,7 @@ import pytest
 
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import ReferenceScales
-from eddies.particles.forms import Form
+from eddies.particles.particle_field import Form
 from eddies.particles.smoothing_kernels import CubicSpline
 from eddies.workflows.rollout.particle_measures import ParticleSpectra, ReconstructedFields, WithGradients
 from tests.particles.configurations import positions

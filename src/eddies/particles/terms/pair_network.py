@@ -11,8 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from eddies.import_path import is_path, load, users_code
-from eddies.particles import moments
-from eddies.particles.context import Context
+from eddies.particles.context import Context, apply_symmetric
 from eddies.particles.dense_network import DenseNetwork
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.pairs import CompiledSum, ScaledPairs
@@ -49,7 +48,7 @@ def along_separation(sums: Tensor, settings: ForceSum, context: Context) -> Tens
     M_i = sum_j w x x^T. It estimates the gradient of a field if f is the difference of this field between i and j.
     """
     if settings.basis == "corrected":
-        return moments.apply_symmetric(context.moments.inverse, sums)
+        return apply_symmetric(context.moments.inverse, sums)
     return scaled(sums, settings, context)
 
 

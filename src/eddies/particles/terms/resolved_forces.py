@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
-from eddies.particles.resolved_velocity import ResolvedFlow
 from eddies.particles.terms.term import Coefficient, Term
 from eddies.scene import terms as declared
 from eddies.spectral.mode_operators import rising
@@ -63,19 +62,12 @@ class Stress(Term):
 
     def forward(self, context: Context) -> Rates:
         flow = context.resolved
-        stress = _deconvolved(flow) if self.settings.form == "deconvolution" else _gradient(flow)
+        if self.settings.form == "deconvolution":
+            stress = flow.filter_transfer * flow.grid.squares(flow.unfiltered) - flow.products
+        else:
+            slopes = flow.grid.slopes(flow.velocity)
+            stress = flow.filter_width**2 / 12 * flow.grid.within(flow.grid.products(slopes, slopes))
         return flow.grid.hidden_stress(stress)
-
-
-def _deconvolved(flow: ResolvedFlow) -> Tensor:
-    """Modes (6, kz, ky, kx) of G(u* u*) - u u."""
-    return flow.filter_transfer * flow.grid.squares(flow.unfiltered) - flow.products
-
-
-def _gradient(flow: ResolvedFlow) -> Tensor:
-    """Modes (6, kz, ky, kx) of (d^2/12) d_k u_i d_k u_j."""
-    slopes = flow.grid.slopes(flow.velocity)
-    return flow.filter_width**2 / 12 * flow.grid.within(flow.grid.products(slopes, slopes))
 
 
 class Damping(Term):
@@ -145,7 +137,7 @@ class Forcing(Term):
     def forward(self, context: Context) -> Rates:
         """Return the modes of the force. Raises TermError if the forced modes have no energy."""
         flow, below = context.resolved, self.settings.wavenumber
-        square = flow.mean_square(flow.unfiltered, 0, below)
+        square = flow.grid.mean_square(flow.unfiltered, 0, below)
         if square == 0 and self.settings.injection_rate > 0:
             raise declared.TermError("injection: the particles have no energy at the forced wavenumbers; remove "
                                      "the forcing, or raise its wavenumber until they have energy there")

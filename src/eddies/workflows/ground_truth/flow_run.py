@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from eddies.clock import Clock, ProgressLine
-from eddies.flow.courant import CourantLimit, FixedStep
+from eddies.flow.stability import CourantLimit, FixedStep, StabilityWatch
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import Fluid
-from eddies.flow.stability import StabilityWatch
 from eddies.flow.statistics import energy_spectrum
 from eddies.flow.tracers import FilteredField, TracerParticles, release
 from eddies.io.checkpoint import Block, Checkpoint, Guard

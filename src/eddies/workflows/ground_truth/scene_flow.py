@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from eddies.flow.courant import CourantLimit, FixedStep
+from eddies.flow.stability import CourantLimit, FixedStep
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.initial_fields import INITIAL_FLOWS, balanced_density, sound_wave_density, velocity_of_spectrum
 from eddies.flow.navier_stokes import FLUIDS, Fluid

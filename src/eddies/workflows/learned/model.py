@@ -19,8 +19,8 @@ from eddies.parallel.broadcast import first_complaint, on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import any_rank
 from eddies.particles.flow_units import ReferenceScales
-from eddies.particles.forms import WORDS, Form
 from eddies.particles.model import LagrangianModel, build_model
+from eddies.particles.particle_field import WORDS, Form
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene.scene import SceneError

@@ -15,8 +15,7 @@ import numpy as np
 
 from eddies.clock import ProgressLine
 from eddies.io.checkpoint import Guard
-from eddies.learning.optimization import Adam
-from eddies.learning.training import Phase, Training, TrainingDiverged
+from eddies.learning.training import Adam, Phase, Training, TrainingDiverged
 from eddies.parallel.halo import HaloError
 from eddies.particles.feature_range import FeatureRange, pair_features
 from eddies.particles.smoothing_kernels import SmoothingKernel

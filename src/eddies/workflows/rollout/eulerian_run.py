@@ -10,11 +10,10 @@ import numpy as np
 import torch
 
 from eddies.clock import Clock
-from eddies.flow.courant import CourantLimit
+from eddies.flow.stability import CourantLimit, quadratic_energy
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.initial_fields import balanced_density
 from eddies.flow.navier_stokes import FLUIDS, Fluid
-from eddies.flow.stability import quadratic_energy
 from eddies.flow.subgrid import Closure, DynamicStress, EddyDamping, SpectralViscosity, StressModel
 from eddies.flow.tracers import FilteredField, TracerParticles
 from eddies.io.checkpoint import Checkpoint

@@ -13,8 +13,7 @@ from eddies.analysis.rollout import Frames
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import ReferenceScales
-from eddies.particles.forms import Form
-from eddies.particles.particle_field import ParticleField
+from eddies.particles.particle_field import Form, ParticleField
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.resolved_velocity import ResolvedVelocity
 

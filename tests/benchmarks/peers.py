@@ -1,17 +1,27 @@
-"""Time of values of a velocity at points, and of their adjoint, by the closure's splines and by FINUFFT, at the same
-points, modes and accuracy.
+"""Parts of the package against other libraries, on the same data, to the same accuracy and in one run.
 
-    OMP_NUM_THREADS=1 .venv/bin/python tests/benchmarks/splines.py [PARTICLES A SIDE] [--threads T]
+    OMP_NUM_THREADS=1 .venv/bin/python tests/benchmarks/peers.py splines [64] [--threads T]    # FINUFFT
+    OMP_NUM_THREADS=1 .venv/bin/python tests/benchmarks/peers.py neighbors [64]                # vesin
+    mpirun -n 2 .venv/bin/python tests/benchmarks/peers.py transforms [64 128]                 # mpi4py-fft
 
-FINUFFT (pip install --no-binary finufft finufft, to build it for this processor) gets its best settings: single
-precision, measured plans that are used again, and the fastest of several grids and of three or two transforms at once;
-the first of two holds two components as real and imaginary part. Its time excludes this packing and the additional
-modes kx < 0 that it needs. The velocity has the spectrum that the closure expects (`ResolvedVelocity`). Errors are
-relative to exact sums at some points and in some modes, weighted by that spectrum. FINUFFT's tolerance is the largest
-with an error not above that of the splines.
+The numbers are particles or points a side, or cells. Prints JSON lines with medians of seconds. The libraries come by
+`pip install --no-binary finufft,vesin finufft vesin mpi4py-fft`; the last one needs FFTW's headers.
 
-Prints JSON lines with median seconds: "interpolation" from modes to points, "spreading" from points to modes, each as a
-whole and between grid and points alone (FINUFFT's `spreadinterponly` with the same grid and tolerance).
+splines: values of a velocity at points, and their adjoint, by the closure's splines. FINUFFT gets its best settings:
+single precision, measured plans that are used again, and the fastest of several grids and of three or two transforms at
+once; the first of two holds two components as real and imaginary part. Its time excludes this packing and the
+additional modes kx < 0 that it needs. The velocity has the spectrum that the closure expects (`ResolvedVelocity`).
+Errors are relative to exact sums at some points and in some modes, weighted by that spectrum. FINUFFT's tolerance is
+the largest with an error not above that of the splines. "interpolation" goes from modes to points, "spreading" from
+points to modes, each as a whole and between grid and points alone (FINUFFT's `spreadinterponly` with the same grid and
+tolerance).
+
+neighbors: all neighbours of random points in a periodic box, both orders of each pair, in double precision on one
+thread. vesin gives the two numbers of each pair, in no order, in memory of its own; ours come in compressed rows.
+
+transforms: forward and backward transforms of three components. mpi4py-fft transforms all modes, and those beyond the
+2/3 rule are set to zero between the two transforms. Its plans are measured, its default. Ours drop these modes on the
+way.
 """
 
 import argparse
@@ -19,7 +29,6 @@ import json
 import math
 from collections.abc import Callable
 
-import finufft
 import numpy as np
 import torch
 from mpi4py import MPI
@@ -27,8 +36,13 @@ from step import in_turn
 
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.fourier_grid import FourierGrid
+from eddies.particles.neighborhood import NeighborList
+from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.resolved_velocity import ResolvedVelocity
+from eddies.spectral.spectral_grid import SpectralGrid
 
+LENGTH = 2 * math.pi
+NEIGHBORS = 60
 PLANES, HIGHEST, CHECKED = 1.75, 0.75, 100
 UPSAMPLING = (1.15, 1.23, 1.25)  # the first is the least that FINUFFT allows; 2, its other standard, takes far longer
 TOLERANCES = [10 ** (-i / 6) for i in range(6, 30)]
@@ -41,7 +55,7 @@ class Case:
     """Points, a velocity with its values there and its modes, and exact sums."""
 
     def __init__(self, side: int) -> None:
-        slab = SlabDecomposition(MPI.COMM_SELF, 2 * math.pi, int(PLANES * side))
+        slab = SlabDecomposition(MPI.COMM_SELF, LENGTH, int(PLANES * side))
         self.grid, random = FourierGrid(slab, int(HIGHEST * side), 1, torch.float32), np.random.default_rng(1)
         self.position = random.uniform(0, slab.length, (side**3, 3))
         self.points = self.grid.points(torch.from_numpy(self.position))
@@ -127,10 +141,11 @@ class Peer:
             result = np.stack([first[0], second[0], first[1]])
         return self.case.error(self.name, result)
 
-    def _plan(self, size: int, tolerance: float, **options: int) -> finufft.Plan:
+    def _plan(self, size: int, tolerance: float, **options: int) -> object:
         kind, sign = (2, 1) if self.name == "interpolation" else (1, -1)
-        plan = finufft.Plan(kind, (size,) * 3, len(self.given), tolerance, sign, "complex64", modeord=1, fftw=MEASURE,
-                            upsampfac=self.upsampling, nthreads=self.threads, **options)
+        from finufft import Plan
+        plan = Plan(kind, (size,) * 3, len(self.given), tolerance, sign, "complex64", modeord=1, fftw=MEASURE,
+                    upsampfac=self.upsampling, nthreads=self.threads, **options)
         plan.setpts(*(np.ascontiguousarray(x, np.float32) for x in self.case.position.T[::-1]))
         return plan
 
@@ -170,18 +185,94 @@ def compare(case: Case, threads: int, name: str) -> list[dict[str, object]]:
     return found
 
 
+def rows(points: torch.Tensor, cutoff: float) -> tuple[np.ndarray, np.ndarray]:
+    """Compressed rows."""
+    found = NeighborList(PeriodicBox(LENGTH, True), cutoff, 0.0)
+    found.build(points, points, exclude_self=True)
+    return found.offsets.numpy(), found.senders.numpy()
+
+
+def peer_transform(comm: MPI.Comm, grid: SpectralGrid, field: np.ndarray) -> Callable[[], np.ndarray]:
+    """The same round trip by mpi4py-fft, also with slabs along z."""
+    from mpi4py_fft import PFFT, newDistArray
+    plan = PFFT(comm, [grid.cells] * 3, axes=(0, 1, 2), dtype=grid.real, grid=(-1,))
+    given, modes, result = (newDistArray(plan, forward, rank=1) for forward in (False, True, False))
+    given[:] = field
+    signed = np.abs(np.fft.fftfreq(grid.cells, 1 / grid.cells))
+    z, y, x = (axis[part] for axis, part in zip((signed, signed, np.arange(grid.cells // 2 + 1)),
+                                                plan.local_slice(True)))
+    kept = np.maximum(np.maximum(z[:, None, None], y[None, :, None]), x[None, None, :]) <= grid.cutoff
+
+    def round_trip() -> np.ndarray:
+        for component, spectral in zip(given, modes):
+            plan.forward(component, spectral)
+        np.multiply(modes, kept, out=modes)
+        for spectral, component in zip(modes, result):
+            plan.backward(spectral, component)
+        return result
+
+    return round_trip
+
+
+def splines(side: int) -> None:
+    from finufft import __version__
+    threads = torch.get_num_threads()
+    with torch.no_grad():
+        case = Case(side)
+        for name in ("interpolation", "spreading"):
+            for found in compare(case, threads, name):
+                about = {"particles": side, "threads": threads, "finufft": __version__, "what": name}
+                print(json.dumps(about | found), flush=True)
+
+
+def neighbors(side: int) -> None:
+    import vesin
+    position = np.random.default_rng(1).uniform(0, LENGTH, (side**3, 3))
+    points, box = torch.from_numpy(position), LENGTH * np.eye(3)
+    cutoff = LENGTH / side * (NEIGHBORS * 3 / (4 * math.pi)) ** (1 / 3)
+    peer = vesin.NeighborList(cutoff=cutoff, full_list=True, n_threads=1)
+    actions: dict[str, Callable[[], tuple[np.ndarray, np.ndarray]]] = {
+        "eddies": lambda: rows(points, cutoff),
+        "vesin": lambda: peer.compute(position, box, True, "ij", copy=False)}
+    offsets, senders = actions["eddies"]()
+    ours = np.sort(np.repeat(np.arange(len(position)), np.diff(offsets)) * len(position) + senders)
+    first, second = (index.astype(np.int64) for index in actions["vesin"]())
+    if not np.array_equal(ours, np.sort(first * len(position) + second)):
+        raise SystemExit("neighbors: the lists differ")
+    middle = in_turn(actions)
+    print(json.dumps({"points": side, "neighbors": len(senders) / len(position), "seconds": middle,
+                      "nanoseconds_per_pair": 1e9 * middle["eddies"] / len(senders),
+                      "ratio": middle["vesin"] / middle["eddies"]}))
+
+
+def transforms(cells: int) -> None:
+    comm = MPI.COMM_WORLD
+    for precision in ("float64", "float32"):
+        grid = SpectralGrid(SlabDecomposition(comm, LENGTH, cells), precision)
+        field = np.random.default_rng(comm.rank).standard_normal((3, *grid.physical_shape)).astype(grid.real)
+        round_trips = {"eddies": lambda: grid.backward(grid.forward(field)),
+                       "mpi4py-fft": peer_transform(comm, grid, field)}
+        ours, theirs = (round_trip() for round_trip in round_trips.values())
+        difference = comm.allreduce(float(np.abs(ours - theirs).max()), MPI.MAX)
+        middle = in_turn({name: lambda round_trip=round_trip: (round_trip(), comm.Barrier())
+                          for name, round_trip in round_trips.items()}, rounds=15)
+        if comm.rank == 0:
+            print(json.dumps({"cells": cells, "precision": precision, "ranks": comm.size, "seconds": middle,
+                              "ratio": middle["mpi4py-fft"] / middle["eddies"], "difference": difference}), flush=True)
+
+
+PARTS = {"splines": splines, "neighbors": neighbors, "transforms": transforms}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("side", nargs="?", type=int, default=64)
+    parser.add_argument("what", choices=PARTS)
+    parser.add_argument("sizes", nargs="*", type=int, default=[64])
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    with torch.no_grad():
-        case = Case(options.side)
-        for name in ("interpolation", "spreading"):
-            for found in compare(case, options.threads, name):
-                print(json.dumps({"particles": options.side, "threads": options.threads, "finufft": finufft.__version__,
-                                  "what": name, **found}), flush=True)
+    for size in options.sizes:
+        PARTS[options.what](size)
 
 
 if __name__ == "__main__":
