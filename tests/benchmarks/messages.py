@@ -1,10 +1,11 @@
 """Messages and bytes that a rank sends in an evaluation of a particle model, by numbers of ranks.
 
-    PYTHONPATH=. .venv/bin/python tests/benchmarks/messages.py [PARTICLES A SIDE] [--models NAME ...] [--ranks R ...]
+    PYTHONPATH=. .venv/bin/python tests/benchmarks/messages.py docs/performance.json [--models NAME ...] [--ranks R ...]
 
 Open MPI counts what each rank sends to each other one (its component pml_monitoring). Collective operations count as
 the messages of which they consist. The difference between a job of four and one of two steps leaves out the start.
-Prints a JSON line for each model and number of ranks: the largest count over ranks and the mean.
+Writes a row `messages` for each model and number of ranks into the file, the largest count over ranks and the mean, and
+prints the table of docs/performance.md.
 """
 
 import argparse
@@ -25,7 +26,7 @@ from eddies.scene.terms import PRESETS
 from mpi_tools.launch import mpi_environment, mpirun_command
 
 STEPS = 2
-MODELS = ("paper", "local", "resolved")
+MODELS = ("paper", "local", "resolved", "resolved + pairs")
 
 
 def advance(side: int, model: str, steps: int) -> None:
@@ -44,8 +45,8 @@ def counted(ranks: int, side: int, model: str, steps: int) -> tuple[int, dict[in
     with tempfile.TemporaryDirectory() as folder:
         monitored = {"OMPI_MCA_pml_monitoring_enable": "2", "OMPI_MCA_pml_monitoring_enable_output": "3",
                      "OMPI_MCA_pml_monitoring_filename": f"{folder}/sent"}
-        done = subprocess.run(mpirun_command(ranks, [sys.executable, "-m", "mpi4py", __file__, str(side), "--models",
-                                                     model, "--steps", str(steps)]),
+        done = subprocess.run(mpirun_command(ranks, [sys.executable, "-m", "mpi4py", __file__, "", "--side", str(side),
+                                                     "--models", model, "--steps", str(steps)]),
                               env=mpi_environment(ranks) | monitored | {"PYTHONPATH": os.pathsep.join(sys.path)},
                               check=True, capture_output=True, text=True)
         sent = {rank: Counter() for rank in range(ranks)}
@@ -56,23 +57,40 @@ def counted(ranks: int, side: int, model: str, steps: int) -> tuple[int, dict[in
     return int(done.stdout), sent
 
 
+def table(rows: list[dict]) -> str:
+    """Messages and kB that a rank sends in an evaluation, on average."""
+    numbers = sorted({row["ranks"] for row in rows})
+    lines = ["| model |" + "|".join(f" {ranks} ranks " for ranks in numbers) + "|", "|---" * (1 + len(numbers)) + "|"]
+    for model in dict.fromkeys(row["model"] for row in rows):
+        cells = {row["ranks"]: f" {row['mean_messages']}; {row['mean_bytes'] / 1000:.0f} kB "
+                 for row in rows if row["model"] == model}
+        lines.append(f"| `{model}` |" + "|".join(cells.get(ranks, " ") for ranks in numbers) + "|")
+    return "\n".join(lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("side", nargs="?", type=int, default=32)
+    parser.add_argument("results", type=Path, help="the file of results")
+    parser.add_argument("--side", type=int, default=32, help="cube root of the number of particles")
     parser.add_argument("--models", nargs="+", choices=PRESETS, default=MODELS)
     parser.add_argument("--ranks", nargs="+", type=int, default=[2, 3, 4, 6, 8])
     parser.add_argument("--steps", type=int, help="take steps as a rank of a job that is counted")
     options = parser.parse_args()
     if options.steps is not None:
         return advance(options.side, *options.models, options.steps)
+    found = json.loads(options.results.read_text())
+    rows = {(row["model"], row["ranks"]): row for row in found.get("messages", [])}
     for model in options.models:
         for ranks in options.ranks:
             (few, before), (many, after) = (counted(ranks, options.side, model, steps) for steps in (STEPS, 2 * STEPS))
             sent = {name: [(after[rank][name] - before[rank][name]) / (many - few) for rank in range(ranks)]
                     for name in ("messages", "bytes")}
-            print(json.dumps({"particles": options.side, "model": model, "ranks": ranks} | {
+            rows[model, ranks] = {"particles": options.side, "model": model, "ranks": ranks} | {
                 f"{kind}_{name}": round(value) for name, values in sent.items()
-                for kind, value in (("most", max(values)), ("mean", sum(values) / ranks))}), flush=True)
+                for kind, value in (("most", max(values)), ("mean", sum(values) / ranks))}
+            found["messages"] = [*rows.values()]
+            options.results.write_text(json.dumps(found, indent=1) + "\n")
+    print(table(found["messages"]))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Cost of an evaluation of a particle model: measurements and bounds, projection to up to 4096 cores, and figure.
 
     OMP_NUM_THREADS=1 .venv/bin/python tests/benchmarks/performance.py measure docs/performance.json  # 10 min
+    PYTHONPATH=. .venv/bin/python tests/benchmarks/messages.py docs/performance.json  # 15 min on two cores
     .venv/bin/python tests/benchmarks/performance.py project docs/performance.json
     .venv/bin/python tests/benchmarks/performance.py draw docs/performance.json docs/performance.png
 
@@ -10,8 +11,9 @@ splines are their arithmetic at the speed of a matrix product, that of transform
 table of seconds per evaluation. It leaves out models that the file does not hold.
 
 `project` measures nothing: seconds of a call and of a unit of work of each part follow from the measured evaluations of
-16^3 and 64^3 particles on one core; messages are those of an assumed network. It writes the rows `projected` into the
-file, and prints the table of docs/performance.md and the deviation of the projection from the measurements.
+16^3 and 64^3 particles on one core; messages and bytes from those counted on up to eight ranks, on an assumed network.
+It writes the rows `projected` into the file, and prints the table of docs/performance.md and the deviation of the
+projection from the measurements.
 """
 
 import argparse
@@ -57,9 +59,7 @@ PROJECTED, TABLE_CORES, MOST_CORES = (64, 128, 256, 512), (16, 64, 256, 1024, 40
 NODE_CORES, RANK_BANDWIDTH, NODE_BANDWIDTH, LATENCY = 64, 2e9, 10e9, 2e-6
 THREADED = "pairs", "splines", "transforms", "modes"  # whose loops the threads of a rank share
 COMPONENTS = {"transforms": TRANSFORMED, "splines": INTERPOLATED}
-# Transforms of an evaluation outside the iterations, which have two each; sums over ranks outside the iterations, and
-# in each; columns that a migration sends.
-CALLS, SUMS, COLUMNS = 8, (11, 2), 8
+ITERATIONS_COUNTED = 2.5     # of the solve with 32^3 particles, whose messages are counted
 # Work of a grid point of a transform over that of 112^3, by cells along a side; beyond 168 measured for the slab of one
 # of many ranks.
 GROWTH = {112: 1.0, 168: 1.4, 448: 1.4, 896: 1.9}
@@ -119,6 +119,15 @@ def bounds(iterations: float) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
+class Counted:
+    """What `messages.py` has counted for a model: messages `first` + `each` (ranks - 1), and bytes over `Job.sent`."""
+
+    first: float
+    each: float
+    bytes: float
+
+
+@dataclass(frozen=True)
 class Job:
     """An evaluation of a scene's model with a number of iterations of the solve, on ranks of some threads."""
 
@@ -149,22 +158,33 @@ class Job:
                 "modes": self.iterations * shells_of(self.scene) ** 3 * self.share, "formulas": own,
                 "settling": own * (MIGRATION if self.ranks > 1 else 1.0)}
 
-    def messages(self) -> float:
-        """Seconds of the messages: transposes between all ranks, ghosts and ghost planes between neighbours, particles
-        that migrate, and sums along a tree."""
-        if self.ranks == 1:
-            return 0.0
+    def sent(self) -> tuple[float, float]:
+        """Bytes that a rank sends: in transposes between all ranks, and to its neighbours (ghost planes, ghosts)."""
         tracers, k = self.scene.tracers, shells_of(self.scene)
-        on_node = min(self.ranks, max(NODE_CORES // self.threads, 1))
-        own = self.components("transforms") * tracers.planes * (2 * k + 1) * (k + 1) * 8 / self.ranks
-        calls = 2 * self.iterations + CALLS
-        sent = own * ((on_node - 1) / self.ranks / RANK_BANDWIDTH
-                      + (self.ranks - on_node) / self.ranks * on_node / NODE_BANDWIDTH)
+        transposed = self.components("transforms") * tracers.planes * (2 * k + 1) * (k + 1) * 8 / self.ranks
         planes = self.components("splines") * 5 * tracers.planes**2 * 4
         ghosts = 2 * tracers.particles * self.scene.interaction_radius / BOX_LENGTH * 80
-        beside = (planes + ghosts * ("pairs" in self.scene.model.reads)) / RANK_BANDWIDTH
-        sums = 2 * math.ceil(math.log2(self.ranks)) * (SUMS[0] + SUMS[1] * self.iterations)
-        return sent + beside + LATENCY * ((calls + COLUMNS) * (self.ranks - 1) + 2 * calls + sums)
+        return (transposed * (self.ranks - 1) / self.ranks,
+                planes + ghosts * ("pairs" in self.scene.model.reads))
+
+    def messages(self, counted: Counted) -> float:
+        """Seconds of the messages on the assumed cluster."""
+        if self.ranks == 1:
+            return 0.0
+        on_node = min(self.ranks, max(NODE_CORES // self.threads, 1))
+        between_all, beside = (counted.bytes * size for size in self.sent())
+        far = (self.ranks - on_node) / (self.ranks - 1)
+        return (between_all * ((1 - far) / RANK_BANDWIDTH + far * on_node / NODE_BANDWIDTH) + beside / RANK_BANDWIDTH
+                + LATENCY * (counted.first + counted.each * (self.ranks - 1)))
+
+
+def counted_of(found: dict, model: str) -> Counted:
+    """The counts of a model, as a linear function of the ranks."""
+    rows = [row for row in found["messages"] if row["model"] == model]
+    each, first = np.polyfit([row["ranks"] - 1 for row in rows], [row["mean_messages"] for row in rows], 1)
+    sent = [sum(Job(scene_of(row["particles"], model), ITERATIONS_COUNTED, row["ranks"]).sent()) for row in rows]
+    share = np.mean([row["mean_bytes"] / size for row, size in zip(rows, sent)])
+    return Counted(float(first), float(each), float(share))
 
 
 def growth(cells: int) -> float:
@@ -193,16 +213,16 @@ def rates(found: dict, model: str) -> dict[str, tuple[float, float]]:
     return result
 
 
-def evaluation(job: Job, of_parts: dict[str, tuple[float, float]]) -> dict[str, float]:
+def evaluation(job: Job, of_parts: dict[str, tuple[float, float]], counted: Counted) -> dict[str, float]:
     """Seconds of each part of an evaluation."""
     units = job.units()
     return {**{part: call + unit * units[part] / (job.threads if part in THREADED else 1)
-               for part, (call, unit) in of_parts.items()}, "messages": job.messages()}
+               for part, (call, unit) in of_parts.items()}, "messages": job.messages(counted)}
 
 
 def projected(found: dict) -> list[dict]:
     """The fastest split of 1, 2, 4, ... cores into ranks and threads, up to the fastest number of cores."""
-    of_parts, rows = rates(found, MODELS[1]), []
+    of_parts, counted, rows = rates(found, MODELS[1]), counted_of(found, MODELS[1]), []
     iterations = next(row["iterations"] for row in found["steps"] if row["particles"] == 64)
     for side in PROJECTED:
         scene, own = scene_of(side, MODELS[1]), []
@@ -210,7 +230,8 @@ def projected(found: dict) -> list[dict]:
         for cores in powers:
             splits = [Job(scene, iterations, ranks, cores // ranks) for ranks in powers
                       if ranks <= cores <= ranks * NODE_CORES and ranks <= min(most_ranks(scene).values())]
-            timed = [(sum((parts := evaluation(job, of_parts)).values()), job.threads, job, parts) for job in splits]
+            timed = [(sum((parts := evaluation(job, of_parts, counted)).values()), job.threads, job, parts)
+                     for job in splits]
             total, threads, job, parts = min(timed, key=lambda row: row[:2], default=(0.0, 0, None, {}))
             if job is not None:
                 own.append({"particles": side, "cores": cores, "ranks": job.ranks, "threads": threads,
@@ -225,7 +246,7 @@ def deviations(found: dict) -> dict[int, float]:
     for row in found["steps"]:
         side = row["particles"]
         job = Job(scene_of(side, row["model"]), row["iterations"], row["ranks"], row["threads"])
-        total = sum(evaluation(job, rates(found, row["model"])).values())
+        total = sum(evaluation(job, rates(found, row["model"]), counted_of(found, row["model"])).values())
         largest[side] = max(largest.get(side, 0.0), abs(total / row["seconds_per_evaluation"] - 1))
     return largest
 
