@@ -24,11 +24,12 @@ from mpi4py import MPI
 from step import best, transform_bounds
 
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.flow_units import resolved_shells
+from eddies.particles.flow_units import planes_for, resolved_shells
 from eddies.report.figures import FOURTH, MODEL, SECOND, THIRD, TRUTH, letter, panels, png, styled
 from eddies.scene.scene import BOX_LENGTH, Scene, load_scene
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.estimates import estimate
+from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.variant_rows import processor
 
 HERE = Path(__file__).parent
@@ -81,7 +82,7 @@ def shells_of(scene: Scene) -> int:
     """Highest wavenumber of the resolved velocity."""
     tracers = scene.tracers
     return resolved_shells(tracers.spacing, tracers.filter_width, estimate(scene).scales["kolmogorov_length"],
-                           BOX_LENGTH, tracers.planes)
+                           BOX_LENGTH, planes_for(tracers.particles))
 
 
 def bounds(iterations: float) -> dict[str, float]:
@@ -89,10 +90,11 @@ def bounds(iterations: float) -> dict[str, float]:
     a, b = np.ones((2, 1024, 1024), np.float32)
     flops = 2 * 1024**3 / best(lambda: a @ b)
     scene = scene_of(64, MODELS[1])
-    particles, slab = scene.tracers.particles, SlabDecomposition(MPI.COMM_SELF, 2 * math.pi, scene.tracers.planes)
+    particles = scene.tracers.particles
+    slab = SlabDecomposition(MPI.COMM_SELF, 2 * math.pi, planes_for(particles))
     grid = SpectralGrid(slab, "float32", shells_of(scene))
     return {"flops": flops,
-            "pairs": particles * scene.neighbors / 2 * PAIR_FLOPS / flops,
+            "pairs": particles * ModelDefinition.of(scene).neighbors / 2 * PAIR_FLOPS / flops,
             "transforms": sum(transform_bounds(grid, 1, 1, 1).values()) * (6 * iterations + TRANSFORMED) / 2,
             "splines": (6 * iterations + INTERPOLATED) * particles * SPLINE_FLOPS / flops}
 

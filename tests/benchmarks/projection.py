@@ -16,7 +16,9 @@ from pathlib import Path
 import numpy as np
 from performance import INTERPOLATED, MODELS, TRANSFORMED, scene_of, shells_of
 
+from eddies.particles.flow_units import planes_for
 from eddies.scene.scene import BOX_LENGTH, Scene
+from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.resources import most_ranks
 
 SIDES, TABLE_CORES, MOST_CORES = (64, 128, 256, 512), (16, 64, 256, 1024, 4096), 4096
@@ -46,7 +48,7 @@ class Job:
     @property
     def share(self) -> float:
         """Share of the planes in the thickest slab."""
-        planes = self.scene.tracers.planes
+        planes = planes_for(self.scene.tracers.particles)
         return math.ceil(planes / self.ranks) / planes
 
     def components(self, part: str) -> float:
@@ -56,12 +58,13 @@ class Job:
     def units(self) -> dict[str, float]:
         """Work of the busiest rank: pairs, components at particles and grid points, modes, particles."""
         tracers, paired = self.scene.tracers, "pairs" in self.scene.model.reads
-        own, points = tracers.particles * self.share, tracers.planes**3 * self.share
+        own, points = tracers.particles * self.share, planes_for(tracers.particles)**3 * self.share
         # Pairs across the faces of a slab are evaluated on both sides.
-        doubled = (self.ranks > 1) * 3 * self.scene.interaction_radius / (8 * self.share * BOX_LENGTH)
-        return {"pairs": own * self.scene.neighbors / 2 * (1 + doubled) * paired,
+        definition = ModelDefinition.of(self.scene)
+        doubled = (self.ranks > 1) * 3 * definition.radius / (8 * self.share * BOX_LENGTH)
+        return {"pairs": own * definition.neighbors / 2 * (1 + doubled) * paired,
                 "splines": self.components("splines") * own,
-                "transforms": self.components("transforms") * points * growth(tracers.planes),
+                "transforms": self.components("transforms") * points * growth(planes_for(tracers.particles)),
                 "modes": self.iterations * shells_of(self.scene) ** 3 * self.share, "formulas": own,
                 "settling": own * (MIGRATION if self.ranks > 1 else 1.0)}
 
@@ -72,12 +75,12 @@ class Job:
             return 0.0
         tracers, k = self.scene.tracers, shells_of(self.scene)
         on_node = min(self.ranks, max(NODE_CORES // self.threads, 1))
-        own = self.components("transforms") * tracers.planes * (2 * k + 1) * (k + 1) * 8 / self.ranks
+        own = self.components("transforms") * planes_for(tracers.particles) * (2 * k + 1) * (k + 1) * 8 / self.ranks
         calls = 2 * self.iterations + CALLS
         sent = own * ((on_node - 1) / self.ranks / RANK_BANDWIDTH
                       + (self.ranks - on_node) / self.ranks * on_node / NODE_BANDWIDTH)
-        planes = self.components("splines") * 5 * tracers.planes**2 * 4
-        ghosts = 2 * tracers.particles * self.scene.interaction_radius / BOX_LENGTH * 80
+        planes = self.components("splines") * 5 * planes_for(tracers.particles)**2 * 4
+        ghosts = 2 * tracers.particles * ModelDefinition.of(self.scene).radius / BOX_LENGTH * 80
         beside = (planes + ghosts * ("pairs" in self.scene.model.reads)) / RANK_BANDWIDTH
         sums = 2 * math.ceil(math.log2(self.ranks)) * (SUMS[0] + SUMS[1] * self.iterations)
         return sent + beside + LATENCY * ((calls + COLUMNS) * (self.ranks - 1) + 2 * calls + sums)

@@ -84,12 +84,9 @@ def test_lengths_of_the_particles():
     scene = load_scene("hit-small")
     tracers = scene.tracers
     assert (tracers.particles, tracers.cells) == (32**3, 48) and tracers.filter_width == pytest.approx(math.pi / 8)
-    within = tracers.particles * (4 / 3) * math.pi * scene.kernel_support**3 / (2 * math.pi)**3
-    assert within == pytest.approx(scene.kernel.neighbors, rel=1e-12)
-    half = load_scene(TINY, ["model.neighbors=28"])  # of the 56 in the kernel's support
-    assert half.interaction_radius == pytest.approx(half.kernel_support / 2 ** (1 / 3), rel=1e-12)
-    alone = replace(load_scene("tracers-only"), kernel=None)
-    assert alone.neighbors == 60 and alone.kernel_support is None
+    radius = tracers.radius_of(scene.kernel.neighbors)
+    assert tracers.particles * (4 / 3) * math.pi * radius**3 / (2 * math.pi)**3 == pytest.approx(
+        scene.kernel.neighbors, rel=1e-12)
     assert load_scene("tracers-only", ["tracers.particles_per_side=2"]).tracers.filter_width == pytest.approx(math.pi)
 
 
@@ -151,10 +148,8 @@ def test_the_seen_fraction_is_that_of_truths_for_training(tmp_path):
     assert (trained.seen_in(own), trained.window, trained.stages) == (0.0, 0.5, load_scene(TINY).stages)
 
 
-def test_forcing_while_tracers_are_followed():
+def test_forcing_while_tracers_are_followed_needs_a_forcing():
     scene = load_scene(TINY, ["tracers.forced=true"])
-    assert scene.rollout_is_forced and not load_scene(TINY).rollout_is_forced
-    assert not load_scene(TINY, ["tracers.forced=true", "simulation.injection=none"]).rollout_is_forced
     replace(scene, spin_up=None)
     with pytest.raises(SceneError, match=r"\[tracers\] forced = true: needs a section \[forcing\]"):
         replace(scene, forcing=None)

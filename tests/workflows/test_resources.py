@@ -7,10 +7,12 @@ import h5py
 import pytest
 
 from eddies.clock import Clock
+from eddies.particles.flow_units import PEAK_VELOCITY, allowed_drift, planes_for
 from eddies.scene.scene import load_scene
 from eddies.workflows.estimates import estimate, measure
-from eddies.workflows.resources import (FLOW_PROCESS, TORCH_PROCESS, Storage, flow_memory, most_disk, most_ranks,
-                                        storage)
+from eddies.workflows.learned.source import ModelDefinition
+from eddies.workflows.resources import (FLOW_PROCESS, TORCH_PROCESS, Storage, flow_memory, forces_rollout, most_disk,
+                                        most_ranks, storage)
 from tests.small_scene import TINY, one_model, scene_file
 
 
@@ -104,13 +106,13 @@ def test_most_ranks_is_what_the_parts_accept(comm, override, most):
     from eddies.spectral.spectral_grid import SpectralGrid
     scene = load_scene(TINY, [override])
     fields, particles = (SlabDecomposition(comm, BOX_LENGTH, planes)
-                         for planes in (scene.tracers.cells, scene.tracers.planes))
+                         for planes in (scene.tracers.cells, planes_for(scene.tracers.particles)))
     assert min(most_ranks(scene).values()) == most
     SplineInterpolation(SpectralGrid(fields), "quintic")
     SplineInterpolation(SpectralGrid(particles), "cubic")
     with nullcontext() if comm.size <= most else pytest.raises(HaloError):
-        require_thick_slabs(fields, scene.kernel_support)
-        require_thick_slabs(particles, scene.interaction_radius * (1 + scene.simulation.skin))
+        require_thick_slabs(fields, scene.tracers.radius_of(scene.kernel.neighbors))
+        require_thick_slabs(particles, ModelDefinition.of(scene).radius * (1 + scene.simulation.skin))
 
 
 @pytest.mark.mpi(1, 2, 3)
@@ -119,7 +121,6 @@ def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(com
     """The grid that the training builds, and the halo of a particle that moved as far as expected."""
     import torch
 
-    from eddies.learning.rollout_training import PEAK_VELOCITY, allowed_drift
     from eddies.parallel.halo import HaloError
     from eddies.parallel.slab import SlabDecomposition
     from eddies.particles.neighborhood import Neighborhood
@@ -141,7 +142,8 @@ def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(com
     by_grid = limits["ghost planes of the grid in the training through horizons"]
     assert (by_reach, by_grid) == (thick, planes)
     speed, tracers = estimate(scene).scales["velocity_rms"], scene.tracers
-    slab, support = SlabDecomposition(comm, BOX_LENGTH, tracers.planes), scene.kernel_support
+    slab = SlabDecomposition(comm, BOX_LENGTH, planes_for(tracers.particles))
+    support = tracers.radius_of(scene.kernel.neighbors)
     time = frames * tracers.frame_interval
     drift = allowed_drift(speed, time)
     assert accepted(lambda: ResolvedVelocity.on_slabs(slab, FLOW.scales, drift)) == (comm.size <= by_grid)
@@ -184,3 +186,9 @@ def test_what_no_term_reads_limits_no_ranks():
     for changes in ([], ["training.horizons.steps=5", "model.path=runs/other"]):
         limits = most_ranks(one_model("hit-small", changes))
         assert min(limits.values()) == 12 and not any("horizons" in reason for reason in limits)
+
+
+def test_a_rollout_is_forced_like_its_truth_unless_it_has_a_power_of_its_own():
+    found = [forces_rollout(load_scene(TINY, [f"tracers.forced={forced}", f"simulation.injection={power}"]))
+             for forced, power in (("true", "truth"), ("false", "truth"), ("true", "none"), ("false", "0.5"))]
+    assert found == [True, False, False, True]

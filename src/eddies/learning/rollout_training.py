@@ -23,8 +23,6 @@ from eddies.particles.resolved_velocity import ResolvedVelocity
 
 # Lower bound of the unit of a band's energy error (see `energy_units`), as a share of the largest unit of any band.
 SLOWEST = 0.1
-# Largest component of the velocity of a particle, divided by the rms u' of a component: expected, and allowed.
-PEAK_VELOCITY, ALLOWED_VELOCITY = 4.0, 6.0
 
 
 @dataclass(frozen=True)
@@ -186,21 +184,6 @@ class RolloutTrainer:
         if self.integrator.dynamics.model.learns_density:
             true = window.density[frame]
             yield "density_loss", particles.density - true, true - window.particles.density
-
-
-def allowed_drift(velocity: float, time: float) -> float:
-    """Return the largest distance from the slab of its rank that a particle may reach in a window that lasts `time`.
-
-    `velocity` is the rms of a velocity component. Particles stay on their rank, so slabs need ghost planes for this
-    distance.
-    """
-    return ALLOWED_VELOCITY * velocity * time
-
-
-def expected_reach(radius: float, velocity: float, time: float) -> float:
-    """Return the thickness that slabs need in a window that lasts `time`, for particles with this `radius` of
-    interaction (`Neighborhood.update`). `velocity` is the rms of a velocity component."""
-    return radius + 2 * PEAK_VELOCITY * velocity * time
 
 
 # The wrapper of `checkpoint` loads torch's compiler, which takes two seconds.

@@ -16,6 +16,11 @@ from eddies.parallel.reduction import global_sum
 # BEYOND_DISSIPATION / eta, where the spectrum ends; and the wavenumber at which the filter's transfer function falls to
 # LEAST_TRANSFER, since the closure divides by this function (docs/closure.md).
 BEYOND_NYQUIST, BEYOND_DISSIPATION, LEAST_TRANSFER = 1.5, 1.05, 0.02
+# Largest component of the velocity of a particle, divided by the rms u' of a component: expected, and allowed.
+PEAK_VELOCITY, ALLOWED_VELOCITY = 4.0, 6.0
+#: Number of cells in the shortest wavelength that the grid of the resolved velocity resolves. Cubic splines can
+#: represent a wave of this length.
+CELLS_PER_WAVENUMBER = 7 / 3
 MAY_VANISH = ("viscosity", "kolmogorov_length")
 MEAN_DENSITY = 1.0
 # Columns that change along a trajectory, and the names of their rates of change.
@@ -88,6 +93,16 @@ def resolved_wavenumber(spacing: float, filter_width: float, kolmogorov_length: 
     return min(highest, BEYOND_DISSIPATION / kolmogorov_length) if kolmogorov_length > 0 else highest
 
 
+def planes_for(particles: int) -> int:
+    """Return the number of cells along each side of the grid of the resolved velocity for a number of particles N:
+    1.75 N^(1/3), rounded to even.
+
+    The highest resolved wavenumber is 0.75 N^(1/3). This is 1.5 times the Nyquist wavenumber N^(1/3) / 2 of the
+    particles. Each rank holds the particles of a slab of the cube, and a slab consists of whole planes of this grid.
+    """
+    return 2 * round(0.75 / 2 * CELLS_PER_WAVENUMBER * round(math.cbrt(particles), 9))
+
+
 def resolved_shells(spacing: float, filter_width: float, kolmogorov_length: float, length: float, planes: int) -> int:
     """Return k_c in units of the smallest wavenumber, rounded down, on a grid of a cube of side `length` with so many
     planes. The result is at least 1."""
@@ -102,6 +117,21 @@ def allowed_step(angle: float, highest: float, speed: float) -> float:
     `angle` = k_c u' dt, in radians, of a wave with the wavenumber k_c.
     """
     return angle / (highest * speed) if speed > 0 else math.inf
+
+
+def allowed_drift(velocity: float, time: float) -> float:
+    """Return the largest distance from the slab of its rank that a particle may reach in a window that lasts `time`.
+
+    `velocity` is the rms of a velocity component. Particles stay on their rank, so slabs need ghost planes for this
+    distance.
+    """
+    return ALLOWED_VELOCITY * velocity * time
+
+
+def expected_reach(radius: float, velocity: float, time: float) -> float:
+    """Return the thickness that slabs need in a window that lasts `time`, for particles with this `radius` of
+    interaction (`Neighborhood.update`). `velocity` is the rms of a velocity component."""
+    return radius + 2 * PEAK_VELOCITY * velocity * time
 
 
 @dataclass(frozen=True)

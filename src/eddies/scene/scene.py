@@ -17,7 +17,7 @@ from eddies.scene.layers import (BUILT_IN, FILE_ONLY_KEYS, VARIANT, Layer, check
                                  command_line, dotted, read_document, with_sections)
 from eddies.scene.model import Model
 from eddies.scene.rules import quoted
-from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, NEIGHBORS, Eulerian, Flow, Forcing, Horizons, Initial,
+from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, Eulerian, Flow, Forcing, Horizons, Initial,
                                    Kernel, Reconstruction, Simulation, SpinUp, Time, Tracers, Tracks, Training)
 from eddies.scene.values import (SceneError, Section, choice, import_paths, integer, integers, key_name, read_section,
                                  section, sections, text, write_section)
@@ -181,51 +181,11 @@ class Scene(Section):
         return 0.0 if others else self.training.window
 
     @property
-    def rollout_is_forced(self) -> bool:
-        """Whether particles of the rollout are forced."""
-        injection = self.simulation.injection if self.simulation else "none"
-        return bool(self.tracers and self.tracers.forced) if injection == "truth" else injection != "none"
-
-    @property
-    def needs_resolved_velocity(self) -> bool:
-        """Whether the velocity must be resolved on a grid, because terms of the model read it or particles are forced.
-
-        The particles are tracers or those of the rollout.
-        """
-        return bool(self.model and "resolved" in self.model.reads or self.tracers and self.tracers.forced
-                    or self.rollout_is_forced)
-
-    @property
-    def tracers_resolving(self) -> Tracers | None:
-        """The section [tracers] with so many particles that one frame of them would resolve the modes of
-        [reconstruction]; None without [tracers] or [reconstruction]."""
-        if self.reconstruction is None or self.tracers is None:
-            return None
-        return self.reconstruction.resolving(self.tracers, (self.tracks or self.tracers).filtered)
-
-    @property
     def coarse_cells(self) -> int:
         """Cells along each side of the coarse grid that moves the particles of the rollout; 0 without one."""
         if self.simulation is None or self.tracers is None or not self.simulation.on_grid:
             return 0
         return (self.eulerian or Eulerian()).cells_for(self.tracers.filter_width)
-
-    @property
-    def kernel_support(self) -> float | None:
-        """Radius h of the smoothing kernel; None without [kernel]."""
-        return self.tracers.radius_of(self.kernel.neighbors) if self.kernel and self.tracers else None
-
-    @property
-    def neighbors(self) -> float:
-        """Mean number of particles within the radius of interaction of pairs."""
-        if self.model and self.model.neighbors is not None:
-            return self.model.neighbors
-        return self.kernel.neighbors if self.kernel else NEIGHBORS
-
-    @property
-    def interaction_radius(self) -> float:
-        """Radius of interaction of pairs; 0 without [tracers]."""
-        return self.tracers.radius_of(self.neighbors) if self.tracers else 0.0
 
     @property
     def foreign(self) -> tuple[str, ...]:

@@ -311,26 +311,6 @@ class Tracers(Section):
         """Cells along each side of the stored fields: as given, or 1.5 N^(1/3) rounded to even."""
         return 2 * round(0.75 * self._per_side) if self.field_cells is None else self.field_cells
 
-    @property
-    def planes(self) -> int:
-        """Number of cells along each side of the grid of the resolved velocity. Each rank holds the particles of a slab
-        of the cube, and a slab consists of whole planes of this grid."""
-        return planes_for(self.particles)
-
-
-#: Number of cells in the shortest wavelength that the grid of the resolved velocity resolves. Cubic splines can
-#: represent a wave of this length.
-CELLS_PER_WAVENUMBER = 7 / 3
-
-
-def planes_for(particles: int) -> int:
-    """Return `Tracers.planes` for a number of particles N: 1.75 N^(1/3), rounded to even.
-
-    The highest resolved wavenumber is 0.75 N^(1/3). This is 1.5 times the Nyquist wavenumber N^(1/3) / 2 of the
-    particles.
-    """
-    return 2 * round(0.75 / 2 * CELLS_PER_WAVENUMBER * round(math.cbrt(particles), 9))
-
 
 #: The defaults of keys of [kernel], and for each preset the values that replace defaults.
 KERNEL_DEFAULTS = {"form": "kriging", "positive": True, "cutoff": "smooth", "normalization_weight": 0.0,

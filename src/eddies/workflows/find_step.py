@@ -39,7 +39,7 @@ from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.particles.exchanges import fluctuations, relative_error
 from eddies.pipeline import STAGES
-from eddies.scene.integrators import MOST_COURANT, SCHEMES
+from eddies.scene.integrators import SCHEMES
 from eddies.scene.scene import Scene, SceneError, Simulation
 from eddies.time_stepping import ETDRK4
 from eddies.workflows.ground_truth.truth import GroundTruth, open_truth
@@ -257,7 +257,7 @@ def integrators(settings: Simulation, span: float) -> Iterator[tuple[str, float,
     """Yield the name, the longest step and the evaluations in a step of each integrator to try. `span` is the duration
     of the short rollouts."""
     if settings.on_grid:
-        yield "etdrk4", MOST_COURANT, ETDRK4.evaluations
+        yield "etdrk4", ETDRK4.most_courant, ETDRK4.evaluations
         return
     # A method of the user ignores the integrator, so one is enough.
     for name in settings.schemes[:1] if is_path(settings.method) else settings.schemes:

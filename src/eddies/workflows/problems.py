@@ -23,7 +23,7 @@ from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm, node_ranks
 from eddies.parallel.reduction import global_min
-from eddies.particles.flow_units import ScaleError, allowed_step, resolved_shells
+from eddies.particles.flow_units import ScaleError, allowed_step, planes_for, resolved_shells
 from eddies.pipeline import STAGES
 from eddies.scene.scene import (BOX_LENGTH, Flow, Forcing, Initial, Model, Reconstruction, Scene, SceneError,
                                 Simulation, Time, Tracers, Tracks, Training)
@@ -33,7 +33,7 @@ from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.ground_truth.scene_flow import given_spectrum, stored_states
 from eddies.workflows.learned.seen import seen_by, seen_flows, start_within_training
 from eddies.workflows.learned.source import ModelDefinition, read_source
-from eddies.workflows.resources import Storage, in_units, most_disk, most_ranks, storage
+from eddies.workflows.resources import Storage, forces_rollout, in_units, most_disk, most_ranks, storage
 from eddies.workflows.variants import Step
 
 LARGEST_MACH = 0.3           # turbulent Mach number; the relative density fluctuations are about the square of it
@@ -267,13 +267,14 @@ def _warnings(step: Step, made: Collection[Path], measured: Measured) -> Iterato
     if "simulate" in stages:
         if "model" in simulation.needs and not math.isinf(simulation.longest_step):
             speed, scales, allowed = expected.rms_speed, expected.scales, None
-            if scene.rollout_is_forced and scales is not None:
+            if forces_rollout(scene) and scales is not None:
                 shells = resolved_shells(tracers.spacing, tracers.filter_width, scales["kolmogorov_length"], BOX_LENGTH,
-                                         tracers.planes)
+                                         planes_for(tracers.particles))
                 allowed = allowed_step(simulation.scheme.angle, shells, scales["velocity_rms"])
             yield from rollout_steps(simulation, allowed, model, StepUnits(
-                radius=scene.interaction_radius, filter_width=tracers.filter_width, sound_speed=scene.flow.sound_speed,
-                velocity=None if speed is None else speed / math.sqrt(3), scheme=simulation.scheme))
+                radius=ModelDefinition.of(scene).radius, filter_width=tracers.filter_width,
+                sound_speed=scene.flow.sound_speed, velocity=None if speed is None else speed / math.sqrt(3),
+                scheme=simulation.scheme))
         yield from beyond_truth(simulation, tracers, scene.seen_in(step.links.get("dns", step.directory)))
     if "train" in stages and model.path and model.weights_file not in made and not model.weights_file.is_file():
         yield (f'[model] path = "{model.path}": `eddies train` needs {model.weights_file}, which does not exist yet; '

@@ -27,7 +27,7 @@ from eddies.parallel.migration import IdOrder, id_block, migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
-from eddies.particles.flow_units import measured_scales
+from eddies.particles.flow_units import measured_scales, planes_for
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.pipeline import STAGES
@@ -125,7 +125,7 @@ def _sections_of(settings: Tracks, learned: bool) -> dict[str, Flow | Tracers]:
                       filter_width=width, turnovers=max(float(tracks.times[-1] / turnover), 1e-6),
                       field_every=settings.field_every)
     viscosity = 0.0 if settings.viscosity is None else settings.viscosity / tracks.unit**2
-    cells, sound = max(tracers.cells, tracers.planes, LEAST_CELLS), settings.sound_speed
+    cells, sound = max(tracers.cells, planes_for(tracers.particles), LEAST_CELLS), settings.sound_speed
     flow = Flow(fluid="incompressible", cells=cells, viscosity=viscosity) if sound is None else Flow(
         fluid="compressible", cells=cells, viscosity=viscosity, sound_speed=sound / tracks.unit)
     return {"flow": flow, "tracers": tracers}

@@ -14,9 +14,10 @@ from torch import Tensor
 from eddies.analysis.lagrangian import evenly
 from eddies.clock import ProgressLine
 from eddies.learning.force_training import FieldLater, ForceTrainer, LossWeights, TrainingFrame
-from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow, allowed_drift
+from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.exchanges import mean_over_ranks
+from eddies.particles.flow_units import allowed_drift
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.model import LagrangianModel
 from eddies.particles.particle_field import grid_points
