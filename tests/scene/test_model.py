@@ -187,9 +187,9 @@ def test_a_wrong_class_is_told_before_any_work(key, path, message):
 def test_needs_of_methods(own):
     own("own_method", "class Run:\n    needs = ('charge',)\n")
     rollout = dict(step=1, turnovers=1, frame_interval=1)
-    assert Simulation(**rollout).needs == ("model",)
-    assert Simulation(method="none", **rollout).needs == Simulation(method="eulerian", **rollout).needs == ()
-    refused('needs = ["charge"]: must be a tuple', lambda: Simulation(method="own_method:Run", **rollout).needs)
+    assert Simulation(**rollout).form.needs == ("model",)
+    assert Simulation(method="none", **rollout).form.needs == Simulation(method="eulerian", **rollout).form.needs == ()
+    refused('needs = ["charge"]: must be a tuple', lambda: Simulation(method="own_method:Run", **rollout).form.needs)
 
 
 def test_another_list_on_the_command_line_replaces_that_of_the_file(tmp_path):

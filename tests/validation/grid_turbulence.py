@@ -88,7 +88,7 @@ def main() -> None:
             cells += [cell(spectrum.sum(1) / truth.sum()), cell(rms)]
         print(f"| `{name}` | {' | '.join(cells)} |")
     given.output.mkdir(parents=True, exist_ok=True)
-    grids = {name for name, variant in scene.variant.items() if variant.simulation.on_grid}
+    grids = {name for name, variant in scene.variant.items() if variant.simulation.form.on_grid}
     draw(found, grids, shells, filter_width).savefig(given.output / "grid-turbulence.png", dpi=100, facecolor="white")
 
 

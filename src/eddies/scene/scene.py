@@ -146,7 +146,7 @@ class Scene(Section):
     def needs_model(self) -> bool:
         """Whether the rollout needs a trained model: to move the particles, or for the damping of a coarse grid."""
         on_grid = self.eulerian is not None and self.eulerian.form.learned
-        return self.simulation is not None and ("model" in self.simulation.needs or on_grid)
+        return self.simulation is not None and ("model" in self.simulation.form.needs or on_grid)
 
     @property
     def own_training(self) -> Training | None:
@@ -183,7 +183,7 @@ class Scene(Section):
     @property
     def coarse_cells(self) -> int:
         """Cells along each side of the coarse grid that moves the particles of the rollout; 0 without one."""
-        if self.simulation is None or self.tracers is None or not self.simulation.on_grid:
+        if self.simulation is None or self.tracers is None or not self.simulation.form.on_grid:
             return 0
         return (self.eulerian or Eulerian()).cells_for(self.tracers.filter_width)
 

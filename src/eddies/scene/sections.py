@@ -541,7 +541,7 @@ class Simulation(Section):
         return tuple(product_file(path, "dns") for path in self.confirmed_on or ())
 
     @property
-    def _properties(self) -> Method:
+    def form(self) -> Method:
         """The properties of the method. A user's class declares its `needs` as an attribute."""
         if not is_path(self.method):
             return METHODS[self.method]
@@ -550,21 +550,6 @@ class Simulation(Section):
             raise SceneError(f"[simulation] method: {quoted(self.method)}: needs = {quoted(needs)}: must be a tuple of "
                              f"any of {', '.join(map(quoted, NEEDS))}")
         return Method(tuple(needs), title=self.method.rpartition(":")[2])
-
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """The needs of the method: any of "model", "density" and "pairs"."""
-        return self._properties.needs
-
-    @property
-    def title(self) -> str:
-        """Name of the method in tables and figures."""
-        return self._properties.title
-
-    @property
-    def on_grid(self) -> bool:
-        """Whether a flow on a coarse grid moves the particles."""
-        return self._properties.on_grid
 
 
 @dataclass(frozen=True)

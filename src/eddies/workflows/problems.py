@@ -265,7 +265,7 @@ def _warnings(step: Step, made: Collection[Path], measured: Measured) -> Iterato
     if "train" in stages and training is not None:
         yield from untrained_terms(model, training)
     if "simulate" in stages:
-        if "model" in simulation.needs and not math.isinf(simulation.longest_step):
+        if "model" in simulation.form.needs and not math.isinf(simulation.longest_step):
             speed, scales, allowed = expected.rms_speed, expected.scales, None
             if forces_rollout(scene) and scales is not None:
                 shells = resolved_shells(tracers.spacing, tracers.filter_width, scales["kolmogorov_length"], BOX_LENGTH,

@@ -238,7 +238,7 @@ def _limits(scene: Scene, measured: Measured) -> Iterator[tuple[str, int]]:
         if scene.eulerian and scene.eulerian.start == "particles":
             yield _of_the_grid(tracers, 0.0)
     elif simulation is not None:
-        reads = {*simulation.needs, *(scene.model.reads if "model" in simulation.needs else ())}
+        reads = {*simulation.form.needs, *(scene.model.reads if "model" in simulation.form.needs else ())}
         radius = ModelDefinition.of(scene).radius
         skin = simulation.skin * radius
         if "pairs" in reads:

@@ -99,7 +99,7 @@ def _unfit(settings: Tracks, learned: Sequence[str], wanted: Reconstruction | No
     if settings.viscosity is None and viscous:
         yield (f'[tracks] viscosity: this key is missing, and the term "{viscous[0]}" needs it; give it, or choose '
                "other terms")
-    if simulation is not None and simulation.on_grid:
+    if simulation is not None and simulation.form.on_grid:
         if settings.viscosity is None:
             yield '[tracks] viscosity: this key is missing, and [simulation] method = "eulerian" needs it; give it'
         if (eulerian or Eulerian()).start != "particles":
