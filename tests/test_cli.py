@@ -291,10 +291,3 @@ def test_a_second_signal_ends_the_process(number):
 def test_a_flow_that_fails_is_an_error_of_one_line(comm, tmp_path, capfd, scene, changes, message):
     refused(comm, capfd, ["dns", scene, "--output", tmp_path, *set_all(changes)], message)
     assert comm.size > 1 or not list(tmp_path.rglob("*.partial"))
-
-
-@pytest.mark.parametrize("scene", ["abc", "nothing"])
-def test_errors_that_cannot_be_written_either(tmp_path, scene):
-    with open("/dev/full", "w") as full:
-        ended = python("-m", "eddies", "dns", scene, *ABC[1:], "--output", tmp_path / "run", stdout=full, stderr=full)
-    assert ended.returncode == 2 and (tmp_path / "run/ground_truth.h5").exists() == (scene == "abc")

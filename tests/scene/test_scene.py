@@ -11,6 +11,7 @@ from eddies.scene.layers import read_document
 from eddies.scene.scene import Eulerian, Flow, Horizons, Scene, SceneError, builtin_scenes, load_scene
 from eddies.scene.schema import json_schema
 from eddies.scene.sections import CLOSURES
+from eddies.scene.terms import TERMS
 from eddies.scene.values import rule_of
 from tests.bad_scenes import BAD_OVERRIDES, BAD_TEXTS
 from tests.small_scene import TINY, scene_error, scene_file
@@ -191,6 +192,8 @@ def test_every_key_is_explained_and_listed():
         for key in fields(kind or Flow):
             rule = rule_of(kind or Flow, key)
             assert rule is None or rule.about and f"\n{key.name} = " in text.replace("\n# ", "\n").replace(": ", " = ")
+    for word, kind in TERMS.items():
+        assert kind.word == word and kind.__doc__ and all(rule_of(kind, key).about for key in fields(kind))
 
 
 @pytest.mark.parametrize("name", NAMES)
