@@ -26,7 +26,7 @@ from eddies.cores import check_threads, default_to_one_thread
 from eddies.errors import UserError
 from eddies.logs import OUTCOME, configure_logging, show_warnings
 from eddies.pipeline import STAGES
-from eddies.scene.scene import SceneError, builtin_scenes, load_scene
+from eddies.scene.scene import SceneError, builtin_scenes, json_schema, load_scene
 
 if TYPE_CHECKING:
     from eddies.parallel.communicator import Comm
@@ -241,7 +241,7 @@ def check_command(options: argparse.Namespace, comm: Comm) -> None:
 def scenes_command(options: argparse.Namespace, comm: Comm) -> None:
     """Print the built-in scenes, one scene with all keys, or the JSON schema of scenes."""
     if options.schema:
-        text = json.dumps(import_module("eddies.scene.schema").json_schema(), indent=1) + "\n"
+        text = json.dumps(json_schema(), indent=1) + "\n"
     elif options.scene:
         text = load_scene(options.scene).to_toml(all_keys=True)
     else:

@@ -8,8 +8,7 @@ import pytest
 
 from eddies.pipeline import STAGES as TABLE
 from eddies.scene.layers import read_document
-from eddies.scene.scene import Eulerian, Flow, Horizons, Scene, SceneError, builtin_scenes, load_scene
-from eddies.scene.schema import json_schema
+from eddies.scene.scene import Eulerian, Flow, Horizons, Scene, SceneError, builtin_scenes, json_schema, load_scene
 from eddies.scene.sections import CLOSURES
 from eddies.scene.terms import TERMS
 from eddies.scene.values import rule_of
