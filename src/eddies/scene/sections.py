@@ -64,10 +64,6 @@ class InitialFlow:
     """Properties of an initial flow that are known before the flow is made."""
 
     keys: tuple[str, ...] = ("amplitude", "peak_wavenumber", "wavenumber", "path", "state")  # its keys in [initial]
-    # The root mean square of the speed, and the largest sum of the magnitudes of the three velocity components, both
-    # divided by the amplitude; None: unknown, or the flow is at rest.
-    rms: float | None = None
-    peak: float | None = None
     turbulent: bool = False  # whether it has many scales; its spectrum then has its peak at `peak_wavenumber`
     sound: bool = False  # whether it is at rest except for sound waves
     steady: bool = False  # whether it has no acceleration without viscosity
@@ -80,10 +76,10 @@ class InitialFlow:
 
 
 INITIAL_FLOWS = {
-    "random": InitialFlow(("amplitude", "peak_wavenumber"), rms=math.sqrt(3), turbulent=True),
-    "taylor-green": InitialFlow(("amplitude",), rms=0.5, peak=1.0, seeded=False),
-    "abc": InitialFlow(("amplitude", "wavenumber"), rms=math.sqrt(3), peak=3 * math.sqrt(2), seeded=False),
-    "shear-wave": InitialFlow(("amplitude", "wavenumber"), rms=math.sqrt(0.5), peak=1.0, steady=True, seeded=False),
+    "random": InitialFlow(("amplitude", "peak_wavenumber"), turbulent=True),
+    "taylor-green": InitialFlow(("amplitude",), seeded=False),
+    "abc": InitialFlow(("amplitude", "wavenumber"), seeded=False),
+    "shear-wave": InitialFlow(("amplitude", "wavenumber"), steady=True, seeded=False),
     "sound-wave": InitialFlow(("amplitude", "wavenumber"), sound=True, seeded=False),
     "file": InitialFlow(("path", "state"), seeded=False),
     "spectrum": InitialFlow(("path",)),

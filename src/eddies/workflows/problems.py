@@ -16,6 +16,7 @@ from pathlib import Path
 from eddies.clock import SAME
 from eddies.errors import UserError
 from eddies.import_path import is_path
+from eddies.flow.initial_fields import SPEEDS
 from eddies.flow.stability import REMEDIES, limits_of_step
 from eddies.io.hdf5 import open_product
 from eddies.io.provenance import product_provenance
@@ -150,9 +151,9 @@ def rank_problems(limits: Mapping[str, int], ranks: int) -> Iterator[str]:
 
 def _strong_forcing(initial: Initial, forcing: Forcing, time: Time) -> Iterator[str]:
     """Yield a problem if the first step of the forcing makes the flow unstable."""
-    if initial.flow.rms is not None:
+    if initial.kind in SPEEDS:
         step = time.step or time.max_step  # a weak flow takes the longest step
-        unit = initial.flow.rms**2 / 2     # energy divided by the square of the amplitude
+        unit = SPEEDS[initial.kind][0]**2 / 2  # energy divided by the square of the amplitude
         energy, gained = unit * initial.amplitude**2, forcing.injection_rate * step
         if gained > MOST_FORCED * energy:
             least = math.sqrt(gained / MOST_FORCED / unit)
