@@ -12,7 +12,7 @@ import pytest
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from tests.bad_scenes import BAD_OVERRIDES, BAD_TEXTS
-from tests.commands import a_simulation, launched, on_ranks, python, refused, run_cli, set_all
+from tests.commands import a_simulation, launched, python, refused, run_cli, set_all
 from tests.small_scene import TINY
 
 ABC = ["abc", "--set", "time.duration=0.1"]
@@ -185,12 +185,6 @@ def test_a_quiet_command_says_where_its_product_is_and_a_verbose_one_every_step(
                            ("--verbose", r"(?s).*dns  step 1  .* s/step .*dns  step 2  .*dns: abc, after .*")):
         assert run_cli("dns", *ABC, option, "--output", tmp_path / option[2:]) == 0
         assert re.fullmatch(output if comm.rank == 0 else "", capfd.readouterr().out)
-
-
-def test_exit_code_of_the_program():
-    ended = on_ranks(2, "-m", "eddies", "check", TINY, "--set", "flow.cels=3")
-    assert ended.returncode == 2
-    assert ended.stderr.count("did you mean cells?") == 1 and "Traceback" not in ended.stderr
 
 
 @pytest.mark.mpi(3, timeout=60)
