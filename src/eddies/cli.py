@@ -300,7 +300,7 @@ def build_parser() -> argparse.ArgumentParser:
         add_scene_options(command)
         if name in ("run", "train", "find-step", "simulate"):
             add_variants(command, "run only this variant of the scene; repeatable")
-        add_job_options(command, "run directory (default: runs/NAME)")
+        add_job_options(command)
     report = add_command(commands, "report", STAGES["report"].about)
     add_run(report, "run")
     add_variants(report, "show this variant after the table of all variants; if given several times, the first one "
@@ -380,10 +380,9 @@ def add_variants(parser: argparse.ArgumentParser, about: str) -> None:
     parser.add_argument("--variant", action="append", default=[], metavar="NAME", dest="variants", help=about)
 
 
-def add_job_options(parser: argparse.ArgumentParser, output: str) -> None:
-    """Add the options of long commands: run directory, replacement of older work, and limits of wall time. `output` is
-    the help of the option --output."""
-    parser.add_argument("--output", type=directory, metavar="DIR", help=output)
+def add_job_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of long commands: run directory, replacement of older work, and limits of wall time."""
+    parser.add_argument("--output", type=directory, metavar="DIR", help="run directory (default: runs/NAME)")
     parser.add_argument("--overwrite", action="store_true", help="replace products and checkpoints of other settings, "
                         "which are otherwise an error. Work of the same settings is kept and continued")
     parser.add_argument("--checkpoint-minutes", type=positive, default=10.0, metavar="M",
