@@ -12,7 +12,7 @@ import pytest
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from tests.bad_scenes import BAD_OVERRIDES, BAD_TEXTS
-from tests.commands import a_simulation, launched, python, refused, run_cli, set_all
+from tests.commands import a_simulation, first_rank, launched, python, refused, run_cli, set_all
 from tests.small_scene import TINY
 
 ABC = ["abc", "--set", "time.duration=0.1"]
@@ -53,9 +53,7 @@ def test_a_command_that_cannot_work_writes_nothing(comm, tmp_path, capfd, argume
 
 @pytest.mark.mpi(2)
 def test_directory_that_cannot_be_made(comm, tmp_path, capfd):
-    if comm.rank == 0:
-        (tmp_path / "file").write_text("")
-    comm.Barrier()
+    first_rank(comm, (tmp_path / "file").write_text, "")
     refused(comm, capfd, ["dns", *ABC, "--output", tmp_path / "file" / "run"], "choose another --output")
 
 
@@ -260,9 +258,7 @@ def test_what_a_killed_job_left_unfinished_is_removed(comm, tmp_path):
 def test_a_limit_of_wall_time_or_a_file_stops_the_job(comm, tmp_path, capfd):
     refused(comm, capfd, ["dns", *ABC, "--output", tmp_path, "--max-minutes", "1e-9"],
             "eddies: stopped by its limit of wall time", code=75)
-    if comm.rank == 0:
-        (tmp_path / "STOP").write_text("")
-    comm.Barrier()
+    first_rank(comm, (tmp_path / "STOP").write_text, "")
     refused(comm, capfd, ["dns", *ABC, "--output", tmp_path], "STOP: ")
 
 

@@ -22,7 +22,7 @@ from eddies.io.hdf5 import (append_frame, create_product, growing_dataset, in_fi
                             write_table)
 from eddies.io.new_files import MARGIN_BYTES, write_files
 from eddies.io.trajectories import TrajectoryWriter
-from tests.commands import on_ranks, python, refused, run_cli
+from tests.commands import first_rank, on_ranks, python, refused, run_cli
 from tests.full_disk import largest_file
 
 SIZES = 2**12, 5 * 2**20 + 1  # of the largest file: at the beginning, and in the frames
@@ -50,9 +50,7 @@ def write(comm, path, frames=4):
 def test_a_full_disk_is_told_and_harms_nothing(comm, tmp_path):
     """The last rank alone meets the limit."""
     path = tmp_path / "rollout.h5"
-    if comm.rank == 0:
-        path.write_text("older")
-    comm.Barrier()
+    first_rank(comm, path.write_text, "older")
     for size in SIZES:
         with largest_file(comm, size, comm.size - 1):
             with pytest.raises(WriteError, match=r"rollout.h5.partial: .*: \d+ bytes wanted, \d+ free; make room"):
