@@ -131,10 +131,12 @@ def flush_output() -> bool:
 
 
 def complain(text: str, prefix: str = "eddies: ") -> None:
-    """Write a message to standard error, each line after `prefix`. A failed write, as to a closed pipe, raises
-    nothing."""
-    with contextlib.suppress(OSError):
+    """Write a message to standard error, each line after `prefix`. A failed write, as to a closed pipe, raises nothing,
+    and the message is dropped."""
+    try:
         print("\n".join(prefix + line for line in text.split("\n")), file=sys.stderr, flush=True)
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
 def catch_signals() -> list[int]:
