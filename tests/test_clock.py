@@ -73,23 +73,20 @@ def progressed(monkeypatch, caplog):
     return run
 
 
-def test_lines_come_by_time_and_not_by_steps(progressed):
-    assert progressed(20 * [1], of=40) == [("1.000", "12", "35 s"), ("1.000", "25", "30 s"), ("1.000", "38", "25 s"),
-                                           ("1.000", "50", "20 s")]
-
-
-def test_the_work_of_an_earlier_job_is_no_measure_of_the_remaining_time(progressed):
-    assert progressed([10], of=10, done=0.5) == [("10.000", "60", "40 s")]
+@pytest.mark.parametrize("steps, given, lines", [
+    (20 * [1], dict(of=40), [("1.000", "12", "35 s"), ("1.000", "25", "30 s"), ("1.000", "38", "25 s"),
+                             ("1.000", "50", "20 s")]),
+    ([10], dict(of=10, done=0.5), [("10.000", "60", "40 s")]),
+    ([1, 1, 1, 1, 8, 8], dict(of=12, renewed_at=5, interval=20.0), [("8.000", "50", "20 s")])],
+    ids=["by time and not by steps", "without the work of an earlier job", "for steps of another kind alone"])
+def test_lines_give_the_median_of_steps_and_the_remaining_time(progressed, steps, given, lines):
+    assert progressed(steps, **given) == lines
 
 
 def test_a_step_counts_without_warm_up_and_storing(progressed, caplog):
     """Two steps of 4 s, two of 1 s, and 2.5 s to store each: half of 20 s is storing."""
     assert progressed([4, 4, 1, 1], of=8, storing=2.5, interval=20.0) == [("1.000", "50", "20 s")]
     assert "1.000 s/step (storing: 50 % of the time)" in caplog.text
-
-
-def test_steps_of_another_kind_have_a_median_of_their_own(progressed):
-    assert progressed([1, 1, 1, 1, 8, 8], of=12, renewed_at=5, interval=20.0) == [("8.000", "50", "20 s")]
 
 
 def test_with_verbose_there_is_a_line_for_every_step(progressed, caplog):

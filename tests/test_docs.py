@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from eddies.cli import main
-from eddies.cli_options import build_parser
+from eddies.cli import build_parser, main
 from eddies.particles.flow_units import BEYOND_DISSIPATION, BEYOND_NYQUIST, LEAST_TRANSFER
 from eddies.particles.resolved_velocity import TOLERANCE, TOLERANCE_PREDICTED, WEIGHT
 from eddies.pipeline import STAGES

@@ -43,8 +43,10 @@ def smaller(tmp_path, monkeypatch, no_figures, quick_solves):
 
 
 @pytest.fixture
-def example(comm, smaller, examples):
+def example(comm, smaller, monkeypatch):
     """A function that runs an example with smaller scenes and returns its run directory."""
+    monkeypatch.setattr(sys, "path", [*sys.path, str(EXAMPLES)])
+
     def run(name):
         runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
         comm.Barrier()
@@ -104,9 +106,3 @@ def test_a_flow_of_the_users(example):
     with h5py.File(run / "ground_truth.h5") as file:
         energies = [file[f"statistics/energy_{axis}"][0] for axis in "xyz"]
     assert energies == pytest.approx([energies[0]] * 3, rel=1e-6) and sum(energies) == pytest.approx(1.5, rel=1e-3)
-
-
-@pytest.fixture
-def examples(monkeypatch):
-    """Make the examples importable."""
-    monkeypatch.setattr(sys, "path", [*sys.path, str(EXAMPLES)])

@@ -67,6 +67,8 @@ class ETDRK4:
     """
 
     evaluations = 4
+    #: the largest stable Courant number; the search for the time step of a coarse grid begins with it
+    most_courant = 1.4
 
     def __init__(self, equation: Any) -> None:
         self.equation = equation

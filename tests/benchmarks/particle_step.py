@@ -31,7 +31,8 @@ from eddies.kernels.modes import ModePasses
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.context import Context
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.flow_units import FlowUnits, ReferenceScales, allowed_step, resolved_wavenumber
+from eddies.particles.flow_units import (FlowUnits, ReferenceScales, allowed_step, planes_for,
+                                         resolved_wavenumber)
 from eddies.particles.fourier_grid import Points
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.least_squares import LeastSquares
@@ -78,7 +79,7 @@ class Run:
         grid, modes = filtered_velocity(comm, side, width)
         scales = turbulence_scales(energy_spectrum(grid, modes), 0.0, 0.0, grid.cutoff)
         self.speed, self.turnover = scales["velocity_rms"], scales["eddy_turnover_time"]
-        slab = SlabDecomposition(comm, 2 * math.pi, tracers.planes)
+        slab = SlabDecomposition(comm, 2 * math.pi, planes_for(tracers.particles))
         columns = release(slab, 1, side**3, "random")
         # The slabs of particles and field have different boundaries.
         spline = SplineInterpolation(grid, "quintic", margin=2)

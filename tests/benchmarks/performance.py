@@ -31,11 +31,12 @@ from mpi4py import MPI
 from step import best, transform_bounds
 
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.flow_units import resolved_shells
+from eddies.particles.flow_units import planes_for, resolved_shells
 from eddies.report.figures import FOURTH, MODEL, SECOND, THIRD, TRUTH, letter, panels, png, styled
 from eddies.scene.scene import BOX_LENGTH, Scene, load_scene
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.estimates import estimate
+from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.resources import most_ranks
 from eddies.workflows.variant_rows import processor
 
@@ -102,7 +103,7 @@ def shells_of(scene: Scene) -> int:
     """Highest wavenumber of the resolved velocity."""
     tracers = scene.tracers
     return resolved_shells(tracers.spacing, tracers.filter_width, estimate(scene).scales["kolmogorov_length"],
-                           BOX_LENGTH, tracers.planes)
+                           BOX_LENGTH, planes_for(tracers.particles))
 
 
 def bounds(iterations: float) -> dict[str, float]:
@@ -110,10 +111,11 @@ def bounds(iterations: float) -> dict[str, float]:
     a, b = np.ones((2, 1024, 1024), np.float32)
     flops = 2 * 1024**3 / best(lambda: a @ b)
     scene = scene_of(64, MODELS[1])
-    particles, slab = scene.tracers.particles, SlabDecomposition(MPI.COMM_SELF, 2 * math.pi, scene.tracers.planes)
+    particles = scene.tracers.particles
+    slab = SlabDecomposition(MPI.COMM_SELF, 2 * math.pi, planes_for(particles))
     grid = SpectralGrid(slab, "float32", shells_of(scene))
     return {"flops": flops,
-            "pairs": particles * scene.neighbors / 2 * PAIR_FLOPS / flops,
+            "pairs": particles * ModelDefinition.of(scene).neighbors / 2 * PAIR_FLOPS / flops,
             "transforms": sum(transform_bounds(grid, 1, 1, 1).values()) * (6 * iterations + TRANSFORMED) / 2,
             "splines": (6 * iterations + INTERPOLATED) * particles * SPLINE_FLOPS / flops}
 
@@ -139,7 +141,7 @@ class Job:
     @property
     def share(self) -> float:
         """Share of the planes in the thickest slab."""
-        planes = self.scene.tracers.planes
+        planes = planes_for(self.scene.tracers.particles)
         return math.ceil(planes / self.ranks) / planes
 
     def components(self, part: str) -> float:
@@ -149,21 +151,22 @@ class Job:
     def units(self) -> dict[str, float]:
         """Work of the busiest rank: pairs, components at particles and grid points, modes, particles."""
         tracers, paired = self.scene.tracers, "pairs" in self.scene.model.reads
-        own, points = tracers.particles * self.share, tracers.planes**3 * self.share
+        planes, definition = planes_for(tracers.particles), ModelDefinition.of(self.scene)
+        own, points = tracers.particles * self.share, planes**3 * self.share
         # Pairs across the faces of a slab are evaluated on both sides.
-        doubled = (self.ranks > 1) * 3 * self.scene.interaction_radius / (8 * self.share * BOX_LENGTH)
-        return {"pairs": own * self.scene.neighbors / 2 * (1 + doubled) * paired,
+        doubled = (self.ranks > 1) * 3 * definition.radius / (8 * self.share * BOX_LENGTH)
+        return {"pairs": own * definition.neighbors / 2 * (1 + doubled) * paired,
                 "splines": self.components("splines") * own,
-                "transforms": self.components("transforms") * points * growth(tracers.planes),
+                "transforms": self.components("transforms") * points * growth(planes),
                 "modes": self.iterations * shells_of(self.scene) ** 3 * self.share, "formulas": own,
                 "settling": own * (MIGRATION if self.ranks > 1 else 1.0)}
 
     def sent(self) -> tuple[float, float]:
         """Bytes that a rank sends: in transposes between all ranks, and to its neighbours (ghost planes, ghosts)."""
-        tracers, k = self.scene.tracers, shells_of(self.scene)
-        transposed = self.components("transforms") * tracers.planes * (2 * k + 1) * (k + 1) * 8 / self.ranks
-        planes = self.components("splines") * 5 * tracers.planes**2 * 4
-        ghosts = 2 * tracers.particles * self.scene.interaction_radius / BOX_LENGTH * 80
+        particles, k = self.scene.tracers.particles, shells_of(self.scene)
+        transposed = self.components("transforms") * planes_for(particles) * (2 * k + 1) * (k + 1) * 8 / self.ranks
+        planes = self.components("splines") * 5 * planes_for(particles) ** 2 * 4
+        ghosts = 2 * particles * ModelDefinition.of(self.scene).radius / BOX_LENGTH * 80
         return (transposed * (self.ranks - 1) / self.ranks,
                 planes + ghosts * ("pairs" in self.scene.model.reads))
 

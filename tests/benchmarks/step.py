@@ -28,8 +28,7 @@ from mpi4py import MPI
 from eddies.flow.initial_fields import balanced_density, random_velocity
 from eddies.flow.navier_stokes import CompressibleFluid
 from eddies.kernels.copies import PlaneCopies
-from eddies.parallel.slab import SlabDecomposition
-from eddies.parallel.transpose import Transpose
+from eddies.parallel.slab import SlabDecomposition, Transpose
 from eddies.spectral.fourier_passes import PlanePass
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ETDRK4

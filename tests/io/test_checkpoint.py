@@ -21,6 +21,7 @@ from eddies.io.errors import ProductError, WriteError
 from eddies.io.hdf5 import create_product, write_table
 from eddies.parallel.slab import block_starts
 from eddies.parallel.stop import Stopped, StopRequest
+from tests.commands import first_rank
 from tests.full_disk import largest_file
 
 SHAPE = (3, 5, 7, 4)  # seven rows along the axis that is cut
@@ -82,10 +83,7 @@ def test_a_checkpoint_of_other_settings_or_with_damage_is_replaced(comm, tmp_pat
     comm.Barrier()
     directory.write(5, {"time": -1.0})
     assert path.stat().st_mtime_ns == written and directory.newest()["time"] == 5 / 3
-    comm.Barrier()
-    if comm.rank == 0:
-        path.write_bytes(path.read_bytes()[:-100])
-    comm.Barrier()
+    first_rank(comm, path.write_bytes, path.read_bytes()[:-100])
     assert fill(comm, tmp_path, [5]).newest()["time"] == 5 / 3
 
 
@@ -219,9 +217,7 @@ def test_all_ranks_raise_if_a_file_cannot_be_removed(comm, tmp_path, monkeypatch
         raise PermissionError(13, "Permission denied", str(path))
 
     directory = fill(comm, tmp_path, [1, 2, 3])
-    if comm.rank == 0:
-        (directory.path / "step-00000009.h5.partial").write_bytes(b"half")
-    comm.Barrier()
+    first_rank(comm, (directory.path / "step-00000009.h5.partial").write_bytes, b"half")
     monkeypatch.setattr(shutil, "rmtree", refuse)
     monkeypatch.setattr(Path, "unlink", refuse)
     with pytest.raises(WriteError, match="checkpoints.*: Permission denied"):

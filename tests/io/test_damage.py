@@ -14,7 +14,6 @@ from eddies.io.errors import ContentError, ProductError
 from eddies.io.fields import FieldWriter
 from eddies.io.hdf5 import (append_frame, create_product, growing_dataset, open_product, read_frame, read_table,
                             write_table)
-from eddies.io.new_files import python_value
 from eddies.io.trajectories import TrajectoryWriter
 from eddies.io.weights import load_weights, save_weights
 
@@ -113,12 +112,6 @@ def test_no_changed_bit_gives_a_wrong_value(comm, tmp_path):
             assert find_damage(comm, path), bit
             found += 1
     assert found > 300
-
-
-@pytest.mark.mpi(1)
-def test_texts_are_read_as_they_were_written(comm, path):
-    with open_product(comm, path, "rollout") as file:
-        assert python_value(file.attrs["kind"]) == "rollout" and float(file["table/number"][()]) == 2.5
 
 
 @pytest.mark.mpi(1, 2)

@@ -14,6 +14,7 @@ from eddies.io.hdf5 import (CHUNK_BYTES, ProductError, create_product, growing_d
 from eddies.io.provenance import product_fingerprint, product_provenance, read_provenance
 from eddies.io.trajectories import TrajectoryWriter
 from eddies.parallel.stop import Stopped
+from tests.commands import first_rank
 from tests.changed_product import changed
 
 
@@ -105,9 +106,7 @@ def test_chunks_hold_at_most_a_mebibyte(comm, tmp_path):
 
 @pytest.mark.mpi(1, 2, timeout=30)
 def test_all_ranks_raise_if_rank_0_cannot_write(comm, tmp_path, monkeypatch):
-    if comm.rank == 0:
-        (tmp_path / "a.h5/something").mkdir(parents=True)
-    comm.Barrier()
+    first_rank(comm, (tmp_path / "a.h5/something").mkdir, parents=True)
     with pytest.raises(WriteError, match="a.h5: Is a directory"):
         in_files(comm, tmp_path / "a.h5", lambda: (tmp_path / "a.h5").write_text("{}"))
 

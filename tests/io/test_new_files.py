@@ -22,8 +22,7 @@ from eddies.io.hdf5 import (append_frame, create_product, growing_dataset, in_fi
                             write_table)
 from eddies.io.new_files import MARGIN_BYTES, write_files
 from eddies.io.trajectories import TrajectoryWriter
-from mpi_tools.launch import mpi_environment, mpirun_command
-from tests.commands import refused, run_cli
+from tests.commands import first_rank, on_ranks, python, refused, run_cli
 from tests.full_disk import largest_file
 
 SIZES = 2**12, 5 * 2**20 + 1  # of the largest file: at the beginning, and in the frames
@@ -51,9 +50,7 @@ def write(comm, path, frames=4):
 def test_a_full_disk_is_told_and_harms_nothing(comm, tmp_path):
     """The last rank alone meets the limit."""
     path = tmp_path / "rollout.h5"
-    if comm.rank == 0:
-        path.write_text("older")
-    comm.Barrier()
+    first_rank(comm, path.write_text, "older")
     for size in SIZES:
         with largest_file(comm, size, comm.size - 1):
             with pytest.raises(WriteError, match=r"rollout.h5.partial: .*: \d+ bytes wanted, \d+ free; make room"):
@@ -119,8 +116,7 @@ def test_a_small_file_system_that_fills(tmp_path):
     if subprocess.run([*alone, "mount", "-t", "tmpfs", "tmpfs", tmp_path], capture_output=True).returncode:
         pytest.skip("no file system may be mounted here, not even in a namespace")
     line = [*alone, sys.executable, "-c", ON_A_SMALL_DISK, str(tmp_path)]
-    ended = subprocess.run(line, cwd=Path(__file__).parents[2], env=mpi_environment(1), capture_output=True, text=True,
-                           timeout=50)
+    ended = subprocess.run(line, cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=50)
     assert (ended.returncode, ended.stderr) == (0, "")
     assert ended.stdout.startswith(f"['older'] {tmp_path}/rollout.h5.partial: ") and "No space left" in ended.stdout
 
@@ -152,8 +148,7 @@ sys.exit(cli.main(["dns", "tiny", "--output", sys.argv[1]]))
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_ranks_end_together_when_hdf5_cannot_write_their_file(tmp_path, ranks):
     """HDF5 does not crash, and no rank waits for ever."""
-    line = mpirun_command(ranks, [sys.executable, "-c", PROGRAM, str(tmp_path / "run")])
-    ended = subprocess.run(line, env=mpi_environment(ranks), capture_output=True, text=True, timeout=50)
+    ended = on_ranks(ranks, "-c", PROGRAM, tmp_path / "run")
     errors = [line for line in ended.stderr.splitlines() if "eddies: error: " in line]
     assert ended.returncode == 2 and len(errors) == 1 and "bytes wanted" in errors[0]
     assert "Traceback" not in ended.stderr and "Signal" not in ended.stderr
@@ -190,8 +185,7 @@ print("made")
 
 def test_a_file_that_was_left_open_does_not_harm_the_next_one(tmp_path):
     """HDF5 writes into the open file at the end of the process, and may crash then."""
-    ended = subprocess.run([sys.executable, "-c", AGAIN, str(tmp_path)], env=mpi_environment(1), capture_output=True,
-                           text=True, timeout=50)
+    ended = python("-c", AGAIN, tmp_path)
     assert ended.stdout == "made\n", ended.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["kernel.h5"]
     with open_to_read(tmp_path / "kernel.h5") as file:

@@ -5,6 +5,7 @@ import pytest
 
 from eddies.io.hdf5 import ProductError
 from eddies.io.weights import load_weights, save_weights
+from tests.changed_product import changed
 
 DESCRIPTION = {"basis": "corrected", "hidden": [16, 16], "scales": {"filter_width": 0.39}}
 
@@ -42,4 +43,14 @@ def test_tensors_that_are_not_finite_are_neither_written_nor_read(comm, tmp_path
         patch.setattr(np, "isfinite", lambda _: np.array(True))
         save_weights(comm, tmp_path / "m.h5", "model", {}, tensors, {})
     with pytest.raises(ProductError, match="tensor scale .*not finite"):
+        load_weights(comm, tmp_path / "m.h5", "model")
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("value", ["nonsense {", 3])
+def test_weights_without_a_description_are_refused(comm, tmp_path, value):
+    save(comm, tmp_path / "m.h5")
+    with changed(tmp_path / "m.h5") as file:
+        file.attrs["description"] = value
+    with pytest.raises(ProductError, match="m.h5: its attribute description"):
         load_weights(comm, tmp_path / "m.h5", "model")

@@ -7,6 +7,7 @@ import pytest
 from eddies.io.hdf5 import create_product
 from eddies.parallel import stop as module
 from eddies.parallel.stop import Stopped, StopRequest
+from tests.commands import first_rank
 from tests.parallel.counting import CountingComm
 
 
@@ -34,10 +35,7 @@ def test_a_signal_of_one_rank_stops_all(comm):
 def test_the_stop_file_is_removed_when_obeyed(comm, tmp_path, now):
     stop = StopRequest(comm, stop_file=tmp_path / "STOP")
     assert not stop()
-    comm.Barrier()
-    if comm.rank == 0:
-        (tmp_path / "STOP").write_text("")
-    comm.Barrier()
+    first_rank(comm, (tmp_path / "STOP").write_text, "")
     assert not stop(), "looked again within the second"
     now["seconds"] = 1.5
     assert stop() and "STOP" in stop.reason
@@ -48,9 +46,7 @@ def test_the_stop_file_is_removed_when_obeyed(comm, tmp_path, now):
 
 @pytest.mark.mpi(2, timeout=30)
 def test_all_ranks_raise_if_the_stop_file_cannot_be_removed(comm, tmp_path, now):
-    if comm.rank == 0:
-        (tmp_path / "STOP").mkdir()
-    comm.Barrier()
+    first_rank(comm, (tmp_path / "STOP").mkdir)
     with pytest.raises(OSError, match="STOP"):
         StopRequest(comm, stop_file=tmp_path / "STOP")()
 

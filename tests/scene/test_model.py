@@ -1,12 +1,11 @@
 """The model of a scene: its terms, their settings in [model.NAME], classes of the user's, the density of the flow."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 
-from eddies.scene.model import settings_class
 from eddies.scene.scene import Flow, Model, Scene, Simulation, Time, load_scene
-from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS, Continuity, PairNetwork, Pressure, Stress
+from eddies.scene.terms import DEFAULT_PRESET, PRESETS, Continuity, PairNetwork, Pressure, Stress
 from tests.small_scene import TINY, scene_error, scene_file
 
 LEARNING = """
@@ -61,12 +60,6 @@ def test_every_preset_is_a_list_of_terms_that_fit_together(tmp_path, name):
     (tmp_path / "again.toml").write_text(scene.to_toml())
     assert load_scene(tmp_path / "again.toml") == scene
     assert scene.model.gives & {"density", "density_rate"} and scene.foreign == ()
-
-
-@pytest.mark.parametrize("word", TERMS)
-def test_every_term_has_settings_that_are_explained(word):
-    kind = settings_class(word)
-    assert kind.word == word and kind.__doc__ and all(field.metadata["rule"].about for field in fields(kind))
 
 
 def test_keys_of_a_term_are_written_over_those_of_the_preset(tmp_path):
@@ -187,9 +180,9 @@ def test_a_wrong_class_is_told_before_any_work(key, path, message):
 def test_needs_of_methods(own):
     own("own_method", "class Run:\n    needs = ('charge',)\n")
     rollout = dict(step=1, turnovers=1, frame_interval=1)
-    assert Simulation(**rollout).needs == ("model",)
-    assert Simulation(method="none", **rollout).needs == Simulation(method="eulerian", **rollout).needs == ()
-    refused('needs = ["charge"]: must be a tuple', lambda: Simulation(method="own_method:Run", **rollout).needs)
+    assert Simulation(**rollout).form.needs == ("model",)
+    assert Simulation(method="none", **rollout).form.needs == Simulation(method="eulerian", **rollout).form.needs == ()
+    refused('needs = ["charge"]: must be a tuple', lambda: Simulation(method="own_method:Run", **rollout).form.needs)
 
 
 def test_another_list_on_the_command_line_replaces_that_of_the_file(tmp_path):

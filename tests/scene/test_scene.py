@@ -8,9 +8,9 @@ import pytest
 
 from eddies.pipeline import STAGES as TABLE
 from eddies.scene.layers import read_document
-from eddies.scene.scene import Eulerian, Flow, Horizons, Scene, SceneError, builtin_scenes, load_scene
-from eddies.scene.schema import json_schema
+from eddies.scene.scene import Eulerian, Flow, Horizons, Scene, SceneError, builtin_scenes, json_schema, load_scene
 from eddies.scene.sections import CLOSURES
+from eddies.scene.terms import TERMS
 from eddies.scene.values import rule_of
 from tests.bad_scenes import BAD_OVERRIDES, BAD_TEXTS
 from tests.small_scene import TINY, scene_error, scene_file
@@ -84,12 +84,9 @@ def test_lengths_of_the_particles():
     scene = load_scene("hit-small")
     tracers = scene.tracers
     assert (tracers.particles, tracers.cells) == (32**3, 48) and tracers.filter_width == pytest.approx(math.pi / 8)
-    within = tracers.particles * (4 / 3) * math.pi * scene.kernel_support**3 / (2 * math.pi)**3
-    assert within == pytest.approx(scene.kernel.neighbors, rel=1e-12)
-    half = load_scene(TINY, ["model.neighbors=28"])  # of the 56 in the kernel's support
-    assert half.interaction_radius == pytest.approx(half.kernel_support / 2 ** (1 / 3), rel=1e-12)
-    alone = replace(load_scene("tracers-only"), kernel=None)
-    assert alone.neighbors == 60 and alone.kernel_support is None
+    radius = tracers.radius_of(scene.kernel.neighbors)
+    assert tracers.particles * (4 / 3) * math.pi * radius**3 / (2 * math.pi)**3 == pytest.approx(
+        scene.kernel.neighbors, rel=1e-12)
     assert load_scene("tracers-only", ["tracers.particles_per_side=2"]).tracers.filter_width == pytest.approx(math.pi)
 
 
@@ -151,10 +148,8 @@ def test_the_seen_fraction_is_that_of_truths_for_training(tmp_path):
     assert (trained.seen_in(own), trained.window, trained.stages) == (0.0, 0.5, load_scene(TINY).stages)
 
 
-def test_forcing_while_tracers_are_followed():
+def test_forcing_while_tracers_are_followed_needs_a_forcing():
     scene = load_scene(TINY, ["tracers.forced=true"])
-    assert scene.rollout_is_forced and not load_scene(TINY).rollout_is_forced
-    assert not load_scene(TINY, ["tracers.forced=true", "simulation.injection=none"]).rollout_is_forced
     replace(scene, spin_up=None)
     with pytest.raises(SceneError, match=r"\[tracers\] forced = true: needs a section \[forcing\]"):
         replace(scene, forcing=None)
@@ -196,6 +191,8 @@ def test_every_key_is_explained_and_listed():
         for key in fields(kind or Flow):
             rule = rule_of(kind or Flow, key)
             assert rule is None or rule.about and f"\n{key.name} = " in text.replace("\n# ", "\n").replace(": ", " = ")
+    for word, kind in TERMS.items():
+        assert kind.word == word and kind.__doc__ and all(rule_of(kind, key).about for key in fields(kind))
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -277,7 +277,7 @@ def compare_with_grid_turbulence(run: Path, output: Path) -> None:
             rms = np.sqrt(np.mean(np.log(spectrum / truth) ** 2, axis=1))
             cells += [spread_cell(spectrum.sum(1) / truth.sum()), spread_cell(rms)]
         print(f"| `{name}` | {' | '.join(cells)} |")
-    grids = {name for name, variant in scene.variant.items() if variant.simulation.on_grid}
+    grids = {name for name, variant in scene.variant.items() if variant.simulation.form.on_grid}
     draw_grid(found, grids, shells, filter_width).savefig(output / "grid-turbulence.png", dpi=100, facecolor="white")
 
 

@@ -107,7 +107,7 @@ def prepared(comm, directory, *args, overrides=(), removals=(), **keys):
 
 def write_kernel(comm, directory, scene):
     """The kernel with initial weights."""
-    network = KernelNetwork(scene.kernel_support, [4])
+    network = KernelNetwork(scene.tracers.radius_of(scene.kernel.neighbors), [4])
     description = {"form": network.formula, "support": network.support, "hidden": [4], "cutoff": "smooth"}
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
     save_weights(comm, directory / "kernel.h5", "kernel", description, weights,

@@ -114,7 +114,7 @@ def test_pairs_outside_the_training_data_are_counted(run_directory):
         low, high = (file[f"feature_range/{bound}"][()] for bound in ("low", "high"))
         description = json.loads(file.attrs["description"])
     scene, length = load_scene(TINY, CHANGES), description["scales"]["filter_width"]
-    support = scene.kernel_support / length
+    support = scene.tracers.radius_of(scene.kernel.neighbors) / length
     # |x|, |v|, x.v
     assert low.shape == high.shape == (3,) and np.all(low < high)
     assert 0 < low[0] < 0.1 * support < 0.99 * support < high[0] <= support and 0 < low[1] and low[2] < 0 < high[2]

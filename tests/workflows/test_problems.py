@@ -14,6 +14,7 @@ from eddies.scene.integrators import SCHEMES
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 from eddies.scene.terms import FilteredEquations, StepUnits
 from eddies.workflows.ground_truth.frame_counts import check_frames
+from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.problems import check_ground_truth, convenient, memory_of_node, problems
 from eddies.workflows.resources import storage
 from eddies.workflows.tracks import with_tracks
@@ -131,7 +132,7 @@ def test_steps_that_are_too_long_for_a_forced_rollout_or_for_a_term(comm, warned
     line, = (line for line in warned(*sound) if "sound" in line)
     scene = load_scene(TINY, sound)
     # Monaghan (1992), with an alpha of 0.05 and a speed of 0.8.
-    longest = 0.4 * scene.interaction_radius / 2 / (0.8 * scene.flow.sound_speed * 1.03)
+    longest = 0.4 * ModelDefinition.of(scene).radius / 2 / (0.8 * scene.flow.sound_speed * 1.03)
     assert float(line.partition("at most ")[2].split()[0]) == pytest.approx(longest, rel=0.1)
     assert warned(*sound, "simulation.step=0.001") == []
 

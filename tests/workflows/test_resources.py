@@ -7,10 +7,12 @@ import h5py
 import pytest
 
 from eddies.clock import Clock
+from eddies.particles.flow_units import planes_for
 from eddies.scene.scene import load_scene
 from eddies.workflows.estimates import estimate, measure
-from eddies.workflows.resources import (FLOW_PROCESS, TORCH_PROCESS, Storage, flow_memory, most_disk, most_ranks,
-                                        storage)
+from eddies.workflows.learned.source import ModelDefinition
+from eddies.workflows.resources import (FLOW_PROCESS, TORCH_PROCESS, Storage, flow_memory, forces_rollout, most_disk,
+                                        most_ranks, storage)
 from tests.small_scene import TINY, one_model, scene_file
 
 
@@ -104,13 +106,13 @@ def test_most_ranks_is_what_the_parts_accept(comm, override, most):
     from eddies.spectral.spectral_grid import SpectralGrid
     scene = load_scene(TINY, [override])
     fields, particles = (SlabDecomposition(comm, BOX_LENGTH, planes)
-                         for planes in (scene.tracers.cells, scene.tracers.planes))
+                         for planes in (scene.tracers.cells, planes_for(scene.tracers.particles)))
     assert min(most_ranks(scene).values()) == most
     SplineInterpolation(SpectralGrid(fields), "quintic")
     SplineInterpolation(SpectralGrid(particles), "cubic")
     with nullcontext() if comm.size <= most else pytest.raises(HaloError):
-        require_thick_slabs(fields, scene.kernel_support)
-        require_thick_slabs(particles, scene.interaction_radius * (1 + scene.simulation.skin))
+        require_thick_slabs(fields, scene.tracers.radius_of(scene.kernel.neighbors))
+        require_thick_slabs(particles, ModelDefinition.of(scene).radius * (1 + scene.simulation.skin))
 
 
 def test_horizons_do_not_limit_the_ranks():
@@ -155,3 +157,9 @@ def test_what_no_term_reads_limits_no_ranks():
     for changes in ([], ["training.horizons.steps=5", "model.path=runs/other"]):
         limits = most_ranks(one_model("hit-small", changes))
         assert min(limits.values()) == 12 and not any("horizons" in reason for reason in limits)
+
+
+def test_a_rollout_is_forced_like_its_truth_unless_it_has_a_power_of_its_own():
+    found = [forces_rollout(load_scene(TINY, [f"tracers.forced={forced}", f"simulation.injection={power}"]))
+             for forced, power in (("true", "truth"), ("false", "truth"), ("true", "none"), ("false", "0.5"))]
+    assert found == [True, False, False, True]

@@ -1,5 +1,7 @@
 """Initial states: random solenoidal turbulence, and flows with known solutions. Fields are modes (c, kz, ky, kx)."""
 
+import math
+
 import numpy as np
 
 from eddies.flow.statistics import energy_spectrum
@@ -110,6 +112,10 @@ INITIAL_FLOWS = {
     "shear-wave": lambda grid, initial, seed: shear_wave(grid, initial.amplitude, initial.wavenumber),
     "sound-wave": lambda grid, initial, seed: np.zeros((3, *grid.spectral_shape), grid.complex),
 }
+#: The root mean square of the speed, and the largest sum of the magnitudes of the three velocity components (None: it
+#: is random), both divided by the amplitude, by [initial] kind.
+SPEEDS = {"random": (math.sqrt(3), None), "taylor-green": (0.5, 1.0), "abc": (math.sqrt(3), 3 * math.sqrt(2)),
+          "shear-wave": (math.sqrt(0.5), 1.0)}
 
 
 def _modes(grid: SpectralGrid, amplitude: float, components: list) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""Initial states of a whole flow, from a ground truth or from velocities of other codes on a periodic cube.
+"""States of a whole flow: Fourier modes in checkpoints, and initial states from a ground truth or from velocities of
+other codes on a periodic cube.
 
 Supported layouts of other codes, with arrays [z, y, x] whose first point is the corner of the cube:
 
@@ -19,11 +20,13 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 from mpi4py import MPI
 
+from eddies.io.checkpoint import Block, Checkpoint
 from eddies.io.damage import open_to_read
 from eddies.io.errors import ContentError, ProductError, read_errors
 from eddies.io.fields import FieldSeries
@@ -250,3 +253,16 @@ def read_spectrum(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise ProductError(f"{path}: must have ascending wavenumbers above 0, no energy below 0, and at least two "
                            "energies above 0")
     return wavenumber, energy
+
+
+def saved_modes(grid: Any, modes: np.ndarray) -> Block:
+    """Return the modes (..., kz, ky, kx) of a `SpectralGrid` for a checkpoint. The axis ky is divided among the
+    ranks."""
+    return Block(modes, int(grid.column_starts[grid.decomposition.rank]), grid.modes, axis=modes.ndim - 2)
+
+
+def restored_modes(grid: Any, saved: Checkpoint, dimensions: int, name: str = "modes") -> np.ndarray:
+    """Return this rank's part of the modes (..., kz, ky, kx) that a checkpoint holds under `name`. `dimensions` is the
+    number of dimensions of this array."""
+    start, stop = grid.column_starts[grid.decomposition.rank:][:2]
+    return saved.read(name, int(start), int(stop), axis=dimensions - 2)

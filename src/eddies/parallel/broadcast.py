@@ -45,12 +45,7 @@ def on_first_rank(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
         except (UserError, OSError) as raised:
             error = raised
     if comm.size > 1:
-        result, kind, arguments, attributes = comm.bcast((result, type(error), _arguments(error),
-                                                          getattr(error, "__dict__", {})))
-        if arguments and comm.rank > 0:
-            error = kind.__new__(kind, *arguments)  # without __init__, which would build the text again
-            error.args = arguments
-            vars(error).update(attributes)
+        result, error = comm.bcast((result, error))
     if error is not None:
         raise error
     return result
@@ -81,10 +76,3 @@ def all_arrive(comm: MPI.Comm) -> bool:
             return False
         time.sleep(0.01)
     return True
-
-
-def _arguments(error: Exception | None) -> tuple:
-    """Return the arguments that give an error the same text on another rank; empty if there is no error."""
-    if isinstance(error, OSError) and error.errno is not None:
-        return error.errno, error.strerror, error.filename and str(error.filename)
-    return () if error is None else (str(error),)

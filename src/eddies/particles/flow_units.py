@@ -16,6 +16,9 @@ from eddies.parallel.reduction import global_sum
 # BEYOND_DISSIPATION / eta, where the spectrum ends; and the wavenumber at which the filter's transfer function falls to
 # LEAST_TRANSFER, since the closure divides by this function (docs/closure.md).
 BEYOND_NYQUIST, BEYOND_DISSIPATION, LEAST_TRANSFER = 1.5, 1.05, 0.02
+#: Number of cells in the shortest wavelength that the grid of the resolved velocity resolves. Cubic splines can
+#: represent a wave of this length.
+CELLS_PER_WAVENUMBER = 7 / 3
 MAY_VANISH = ("viscosity", "kolmogorov_length")
 MEAN_DENSITY = 1.0
 # Columns that change along a trajectory, and the names of their rates of change.
@@ -86,6 +89,16 @@ def resolved_wavenumber(spacing: float, filter_width: float, kolmogorov_length: 
     """Return k_c, the highest wavenumber of a filtered velocity that particles with this spacing resolve."""
     highest = min(BEYOND_NYQUIST * math.pi / spacing, math.sqrt(-24 * math.log(LEAST_TRANSFER)) / filter_width)
     return min(highest, BEYOND_DISSIPATION / kolmogorov_length) if kolmogorov_length > 0 else highest
+
+
+def planes_for(particles: int) -> int:
+    """Return the number of cells along each side of the grid of the resolved velocity for a number of particles N:
+    1.75 N^(1/3), rounded to even.
+
+    The highest resolved wavenumber is 0.75 N^(1/3). This is 1.5 times the Nyquist wavenumber N^(1/3) / 2 of the
+    particles. Each rank holds the particles of a slab of the cube, and a slab consists of whole planes of this grid.
+    """
+    return 2 * round(0.75 / 2 * CELLS_PER_WAVENUMBER * round(math.cbrt(particles), 9))
 
 
 def resolved_shells(spacing: float, filter_width: float, kolmogorov_length: float, length: float, planes: int) -> int:

@@ -214,7 +214,7 @@ def check_density(flow: Flow, model: Model | None, simulation: Simulation | None
         if "density_rate" in one.gives and incompressible:
             yield "model.terms", (f'"{name}" gives a rate of density, which an incompressible flow does not have; '
                                   f"remove it, {remedy}")
-    if simulation and "density" in simulation.needs and incompressible:
+    if simulation and "density" in simulation.form.needs and incompressible:
         yield "simulation.method", ("needs the density, which an incompressible flow does not have; choose "
                                     f"another, {remedy}")
 

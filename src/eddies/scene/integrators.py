@@ -3,9 +3,6 @@ torch."""
 
 from dataclasses import dataclass
 
-#: The largest stable Courant number of ETDRK4. The search for the time step of a coarse grid begins with it.
-MOST_COURANT = 1.4
-
 
 @dataclass(frozen=True, kw_only=True)
 class Scheme:

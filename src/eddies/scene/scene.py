@@ -6,7 +6,7 @@ An optional section that is absent is None. Variants of a scene are scenes that 
 import copy
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,12 @@ from eddies.scene import checks
 from eddies.scene.layers import (BUILT_IN, FILE_ONLY_KEYS, VARIANT, Layer, check_command_line, check_variant,
                                  command_line, dotted, read_document, with_sections)
 from eddies.scene.model import Model
-from eddies.scene.rules import quoted
-from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, NEIGHBORS, Eulerian, Flow, Forcing, Horizons, Initial,
+from eddies.scene.rules import Rule, quoted
+from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, Eulerian, Flow, Forcing, Horizons, Initial,
                                    Kernel, Reconstruction, Simulation, SpinUp, Time, Tracers, Tracks, Training)
-from eddies.scene.values import (SceneError, Section, choice, import_paths, integer, integers, key_name, read_section,
-                                 section, sections, text, write_section)
+from eddies.scene.terms import TERMS
+from eddies.scene.values import (ABSENT, SceneError, Section, choice, import_paths, integer, integers, key_name,
+                                 read_section, rule_of, section, sections, text, write_section)
 
 __all__ = ["BOX_LENGTH", "REALISATION", "Scene", "SceneError", "builtin_scenes", "load_scene", "stored_scene",
            "Eulerian", "Flow",
@@ -146,7 +147,7 @@ class Scene(Section):
     def needs_model(self) -> bool:
         """Whether the rollout needs a trained model: to move the particles, or for the damping of a coarse grid."""
         on_grid = self.eulerian is not None and self.eulerian.form.learned
-        return self.simulation is not None and ("model" in self.simulation.needs or on_grid)
+        return self.simulation is not None and ("model" in self.simulation.form.needs or on_grid)
 
     @property
     def own_training(self) -> Training | None:
@@ -181,51 +182,11 @@ class Scene(Section):
         return 0.0 if others else self.training.window
 
     @property
-    def rollout_is_forced(self) -> bool:
-        """Whether particles of the rollout are forced."""
-        injection = self.simulation.injection if self.simulation else "none"
-        return bool(self.tracers and self.tracers.forced) if injection == "truth" else injection != "none"
-
-    @property
-    def needs_resolved_velocity(self) -> bool:
-        """Whether the velocity must be resolved on a grid, because terms of the model read it or particles are forced.
-
-        The particles are tracers or those of the rollout.
-        """
-        return bool(self.model and "resolved" in self.model.reads or self.tracers and self.tracers.forced
-                    or self.rollout_is_forced)
-
-    @property
-    def tracers_resolving(self) -> Tracers | None:
-        """The section [tracers] with so many particles that one frame of them would resolve the modes of
-        [reconstruction]; None without [tracers] or [reconstruction]."""
-        if self.reconstruction is None or self.tracers is None:
-            return None
-        return self.reconstruction.resolving(self.tracers, (self.tracks or self.tracers).filtered)
-
-    @property
     def coarse_cells(self) -> int:
         """Cells along each side of the coarse grid that moves the particles of the rollout; 0 without one."""
-        if self.simulation is None or self.tracers is None or not self.simulation.on_grid:
+        if self.simulation is None or self.tracers is None or not self.simulation.form.on_grid:
             return 0
         return (self.eulerian or Eulerian()).cells_for(self.tracers.filter_width)
-
-    @property
-    def kernel_support(self) -> float | None:
-        """Radius h of the smoothing kernel; None without [kernel]."""
-        return self.tracers.radius_of(self.kernel.neighbors) if self.kernel and self.tracers else None
-
-    @property
-    def neighbors(self) -> float:
-        """Mean number of particles within the radius of interaction of pairs."""
-        if self.model and self.model.neighbors is not None:
-            return self.model.neighbors
-        return self.kernel.neighbors if self.kernel else NEIGHBORS
-
-    @property
-    def interaction_radius(self) -> float:
-        """Radius of interaction of pairs; 0 without [tracers]."""
-        return self.tracers.radius_of(self.neighbors) if self.tracers else 0.0
 
     @property
     def foreign(self) -> tuple[str, ...]:
@@ -411,3 +372,54 @@ def _variant(document: dict[str, Any], name: str, layer: Layer) -> Scene:
 def builtin_scenes() -> list[tuple[str, str]]:
     """Return (name, title) for each scene that comes with the package, in order of name."""
     return [(path.stem, read_document(path.stem)[1]["title"]) for path in sorted(BUILT_IN.glob("*.toml"))]
+
+
+# ---- JSON schema, with which editors complete and check the files of scenes
+
+TYPES = {float: "number", int: "integer", bool: "boolean", str: "string"}
+LIMITS = {"above": "exclusiveMinimum", "at_least": "minimum", "below": "exclusiveMaximum", "at_most": "maximum"}
+
+
+def json_schema() -> dict[str, Any]:
+    """Return the JSON schema (draft 2020-12) of a scene file.
+
+    The schema requires no key, because the base of a scene may give any key. In a section [model.NAME] of a user's own
+    term it accepts all keys.
+    """
+    schema = _object(Scene)
+    schema["properties"] |= {
+        "base": {"type": "string", "description": "name or path of the scene that this one starts from"},
+        "unset": {"type": "array", "items": {"type": "string"}, "description": "removed keys of the base"},
+        VARIANT: {"type": "object", "additionalProperties": {"$ref": "#"}, "description": "changed keys by variant"}}
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "scene of eddies"} | schema
+
+
+def _object(kind: type[Section]) -> dict[str, Any]:
+    """Return the schema of a section."""
+    properties = {}
+    for field in fields(kind):
+        rule, inner = rule_of(kind, field), field.metadata.get("section")
+        if inner is not None:
+            properties[field.name] = _object(inner)
+        elif rule is not None:
+            properties[field.name] = _value(rule, field.default)
+    if kind is Model:
+        properties |= {word: _object(settings) for word, settings in TERMS.items()}
+    return {"type": "object", "description": str(kind.__doc__).splitlines()[0], "properties": properties,
+            "additionalProperties": {"type": "object"} if kind._holder else False}
+
+
+def _value(rule: Rule, default: Any) -> dict[str, Any]:
+    """Return the schema of one key."""
+    choices: list[dict[str, Any]] = [{"enum": [*rule.words]}] if rule.words else []
+    if rule.paths:
+        choices.append({"type": "string", "pattern": ":"})
+    if rule.kind is not str or not rule.words:
+        limits = {LIMITS[name]: bound for name, bound in rule.bounds.given.items()}
+        choices.append({"type": TYPES[rule.kind]} | limits)
+    if rule.many:
+        choices = [{"type": "array", "items": choices[0] if len(choices) == 1 else {"anyOf": choices}}]
+    if default is None:
+        choices.append({"const": ABSENT})
+    given = {"default": default} if default not in (None, MISSING) else {}
+    return (choices[0] if len(choices) == 1 else {"anyOf": choices}) | {"description": rule.about} | given

@@ -64,10 +64,6 @@ class InitialFlow:
     """Properties of an initial flow that are known before the flow is made."""
 
     keys: tuple[str, ...] = ("amplitude", "peak_wavenumber", "wavenumber", "path", "state")  # its keys in [initial]
-    # The root mean square of the speed, and the largest sum of the magnitudes of the three velocity components, both
-    # divided by the amplitude; None: unknown, or the flow is at rest.
-    rms: float | None = None
-    peak: float | None = None
     turbulent: bool = False  # whether it has many scales; its spectrum then has its peak at `peak_wavenumber`
     sound: bool = False  # whether it is at rest except for sound waves
     steady: bool = False  # whether it has no acceleration without viscosity
@@ -80,10 +76,10 @@ class InitialFlow:
 
 
 INITIAL_FLOWS = {
-    "random": InitialFlow(("amplitude", "peak_wavenumber"), rms=math.sqrt(3), turbulent=True),
-    "taylor-green": InitialFlow(("amplitude",), rms=0.5, peak=1.0, seeded=False),
-    "abc": InitialFlow(("amplitude", "wavenumber"), rms=math.sqrt(3), peak=3 * math.sqrt(2), seeded=False),
-    "shear-wave": InitialFlow(("amplitude", "wavenumber"), rms=math.sqrt(0.5), peak=1.0, steady=True, seeded=False),
+    "random": InitialFlow(("amplitude", "peak_wavenumber"), turbulent=True),
+    "taylor-green": InitialFlow(("amplitude",), seeded=False),
+    "abc": InitialFlow(("amplitude", "wavenumber"), seeded=False),
+    "shear-wave": InitialFlow(("amplitude", "wavenumber"), steady=True, seeded=False),
     "sound-wave": InitialFlow(("amplitude", "wavenumber"), sound=True, seeded=False),
     "file": InitialFlow(("path", "state"), seeded=False),
     "spectrum": InitialFlow(("path",)),
@@ -310,26 +306,6 @@ class Tracers(Section):
     def cells(self) -> int:
         """Cells along each side of the stored fields: as given, or 1.5 N^(1/3) rounded to even."""
         return 2 * round(0.75 * self._per_side) if self.field_cells is None else self.field_cells
-
-    @property
-    def planes(self) -> int:
-        """Number of cells along each side of the grid of the resolved velocity. Each rank holds the particles of a slab
-        of the cube, and a slab consists of whole planes of this grid."""
-        return planes_for(self.particles)
-
-
-#: Number of cells in the shortest wavelength that the grid of the resolved velocity resolves. Cubic splines can
-#: represent a wave of this length.
-CELLS_PER_WAVENUMBER = 7 / 3
-
-
-def planes_for(particles: int) -> int:
-    """Return `Tracers.planes` for a number of particles N: 1.75 N^(1/3), rounded to even.
-
-    The highest resolved wavenumber is 0.75 N^(1/3). This is 1.5 times the Nyquist wavenumber N^(1/3) / 2 of the
-    particles.
-    """
-    return 2 * round(0.75 / 2 * CELLS_PER_WAVENUMBER * round(math.cbrt(particles), 9))
 
 
 #: The defaults of keys of [kernel], and for each preset the values that replace defaults.
@@ -561,7 +537,7 @@ class Simulation(Section):
         return tuple(product_file(path, "dns") for path in self.confirmed_on or ())
 
     @property
-    def _properties(self) -> Method:
+    def form(self) -> Method:
         """The properties of the method. A user's class declares its `needs` as an attribute."""
         if not is_path(self.method):
             return METHODS[self.method]
@@ -570,21 +546,6 @@ class Simulation(Section):
             raise SceneError(f"[simulation] method: {quoted(self.method)}: needs = {quoted(needs)}: must be a tuple of "
                              f"any of {', '.join(map(quoted, NEEDS))}")
         return Method(tuple(needs), title=self.method.rpartition(":")[2])
-
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """The needs of the method: any of "model", "density" and "pairs"."""
-        return self._properties.needs
-
-    @property
-    def title(self) -> str:
-        """Name of the method in tables and figures."""
-        return self._properties.title
-
-    @property
-    def on_grid(self) -> bool:
-        """Whether a flow on a coarse grid moves the particles."""
-        return self._properties.on_grid
 
 
 @dataclass(frozen=True)

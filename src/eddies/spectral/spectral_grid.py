@@ -9,8 +9,7 @@ from eddies.kernels.copies import Blocks, Described
 from eddies.kernels.library import require
 from eddies.parallel.migration import Redistribution
 from eddies.parallel.reduction import global_sum
-from eddies.parallel.slab import SlabDecomposition, block_starts
-from eddies.parallel.transpose import Transpose
+from eddies.parallel.slab import SlabDecomposition, Transpose, block_starts
 from eddies.spectral.fourier_passes import ColumnPass, Part, PlanePass
 from eddies.spectral.mode_operators import ModeOperators
 

@@ -10,6 +10,7 @@ from typing import Any
 from eddies.clock import Clock, ladder_step
 from eddies.errors import UserError
 from eddies.flow.history import FlowHistory
+from eddies.flow.initial_fields import SPEEDS
 from eddies.flow.navier_stokes import advective_speed
 from eddies.flow.statistics import derived_scales
 from eddies.parallel.communicator import Comm
@@ -140,7 +141,7 @@ def _speeds(scene: Scene, known: Mapping[str, float] | None) -> tuple[
         return scales, PEAK_SPEED * speed, math.sqrt(3) * speed
     if initial.flow.sound:
         return None, initial.amplitude * scene.flow.sound_speed, None
-    peak, rms = (each and each * initial.amplitude for each in (initial.flow.peak, initial.flow.rms))
+    rms, peak = (each and each * initial.amplitude for each in SPEEDS.get(initial.kind, (None, None)))
     return None, peak, rms
 
 

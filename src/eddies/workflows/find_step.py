@@ -39,7 +39,7 @@ from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.particles.exchanges import fluctuations, relative_error
 from eddies.pipeline import STAGES
-from eddies.scene.integrators import MOST_COURANT, SCHEMES
+from eddies.scene.integrators import SCHEMES
 from eddies.scene.scene import Scene, SceneError, Simulation
 from eddies.time_stepping import ETDRK4
 from eddies.workflows.ground_truth.truth import GroundTruth, open_truth
@@ -247,17 +247,18 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             "turnovers": span / stretches[0].turnover})
         for name, table in tables.items():
             write_table(file, f"trials/{name}", Table(table, units={
-                "seconds_per_turnover": "s", **({} if settings.on_grid else {"size": "T"})}))
+                "seconds_per_turnover": "s", **({} if settings.form.on_grid else {"size": "T"})}))
     log.info("find-step: found %s with %s %.4g, %.3g s per turnover. With half the value the final velocity "
              "differs by %.4f of its rms, and the error is %.4f", found.step.integrator,
-             "Courant number" if settings.on_grid else "step", found.step.size, found.seconds, difference, half.error)
+             "Courant number" if settings.form.on_grid else "step", found.step.size, found.seconds, difference,
+             half.error)
 
 
 def integrators(settings: Simulation, span: float) -> Iterator[tuple[str, float, int]]:
     """Yield the name, the longest step and the evaluations in a step of each integrator to try. `span` is the duration
     of the short rollouts."""
-    if settings.on_grid:
-        yield "etdrk4", MOST_COURANT, ETDRK4.evaluations
+    if settings.form.on_grid:
+        yield "etdrk4", ETDRK4.most_courant, ETDRK4.evaluations
         return
     # A method of the user ignores the integrator, so one is enough.
     for name in settings.schemes[:1] if is_path(settings.method) else settings.schemes:

@@ -16,6 +16,7 @@ from pathlib import Path
 from eddies.clock import SAME
 from eddies.errors import UserError
 from eddies.import_path import is_path
+from eddies.flow.initial_fields import SPEEDS
 from eddies.flow.stability import REMEDIES, limits_of_step
 from eddies.io.hdf5 import open_product
 from eddies.io.provenance import product_provenance
@@ -23,7 +24,7 @@ from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm, node_ranks
 from eddies.parallel.reduction import global_min
-from eddies.particles.flow_units import ScaleError, allowed_step, resolved_shells
+from eddies.particles.flow_units import ScaleError, allowed_step, planes_for, resolved_shells
 from eddies.pipeline import STAGES
 from eddies.scene.scene import (BOX_LENGTH, Flow, Forcing, Initial, Model, Reconstruction, Scene, SceneError,
                                 Simulation, Time, Tracers, Tracks, Training)
@@ -33,7 +34,7 @@ from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.ground_truth.scene_flow import given_spectrum, stored_states
 from eddies.workflows.learned.seen import seen_by, seen_flows, start_within_training
 from eddies.workflows.learned.source import ModelDefinition, read_source
-from eddies.workflows.resources import Storage, in_units, most_disk, most_ranks, storage
+from eddies.workflows.resources import Storage, forces_rollout, in_units, most_disk, most_ranks, storage
 from eddies.workflows.variants import Step
 
 LARGEST_MACH = 0.3           # turbulent Mach number; the relative density fluctuations are about the square of it
@@ -150,9 +151,9 @@ def rank_problems(limits: Mapping[str, int], ranks: int) -> Iterator[str]:
 
 def _strong_forcing(initial: Initial, forcing: Forcing, time: Time) -> Iterator[str]:
     """Yield a problem if the first step of the forcing makes the flow unstable."""
-    if initial.flow.rms is not None:
+    if initial.kind in SPEEDS:
         step = time.step or time.max_step  # a weak flow takes the longest step
-        unit = initial.flow.rms**2 / 2     # energy divided by the square of the amplitude
+        unit = SPEEDS[initial.kind][0]**2 / 2  # energy divided by the square of the amplitude
         energy, gained = unit * initial.amplitude**2, forcing.injection_rate * step
         if gained > MOST_FORCED * energy:
             least = math.sqrt(gained / MOST_FORCED / unit)
@@ -265,15 +266,16 @@ def _warnings(step: Step, made: Collection[Path], measured: Measured) -> Iterato
     if "train" in stages and training is not None:
         yield from untrained_terms(model, training)
     if "simulate" in stages:
-        if "model" in simulation.needs and not math.isinf(simulation.longest_step):
+        if "model" in simulation.form.needs and not math.isinf(simulation.longest_step):
             speed, scales, allowed = expected.rms_speed, expected.scales, None
-            if scene.rollout_is_forced and scales is not None:
+            if forces_rollout(scene) and scales is not None:
                 shells = resolved_shells(tracers.spacing, tracers.filter_width, scales["kolmogorov_length"], BOX_LENGTH,
-                                         tracers.planes)
+                                         planes_for(tracers.particles))
                 allowed = allowed_step(simulation.scheme.angle, shells, scales["velocity_rms"])
             yield from rollout_steps(simulation, allowed, model, StepUnits(
-                radius=scene.interaction_radius, filter_width=tracers.filter_width, sound_speed=scene.flow.sound_speed,
-                velocity=None if speed is None else speed / math.sqrt(3), scheme=simulation.scheme))
+                radius=ModelDefinition.of(scene).radius, filter_width=tracers.filter_width,
+                sound_speed=scene.flow.sound_speed, velocity=None if speed is None else speed / math.sqrt(3),
+                scheme=simulation.scheme))
         yield from beyond_truth(simulation, tracers, scene.seen_in(step.links.get("dns", step.directory)))
     if "train" in stages and model.path and model.weights_file not in made and not model.weights_file.is_file():
         yield (f'[model] path = "{model.path}": `eddies train` needs {model.weights_file}, which does not exist yet; '

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from eddies.clock import ProgressLine
 from eddies.io.checkpoint import Checkpoint, Guard
+from eddies.io.flow_states import restored_modes, saved_modes
 from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments, TrajectoryLayout
 from eddies.io.hdf5 import File, Table, create_product, open_product, read_attributes, write_table
 from eddies.io.new_files import set_attributes
@@ -33,7 +34,6 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Reconstruction, Scene, Tracers, Tracks
 from eddies.scene.sections import NEIGHBORS, RECONSTRUCTED
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
-from eddies.workflows.ground_truth.flow_run import restored_modes, saved_modes
 from eddies.workflows.ground_truth.track_frames import TrackFrames, count_for
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import load_form

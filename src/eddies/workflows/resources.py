@@ -15,14 +15,16 @@ from eddies.flow.history import EVERY
 from eddies.io.checkpoint import KEPT
 from eddies.io.provenance import product_attributes
 from eddies.parallel.halo import thick_slabs
-from eddies.scene.integrators import MOST_COURANT
+from eddies.particles.flow_units import planes_for
 from eddies.scene.rules import quoted
 from eddies.scene.scene import BOX_LENGTH, Flow, Scene, Tracers
 from eddies.scene.sections import NEIGHBORS, RECONSTRUCTED
 from eddies.spectral.fourier_passes import BLOCK_BYTES
 from eddies.spectral.interpolation import margin_for, spline_ranks
+from eddies.time_stepping import ETDRK4
 from eddies.workflows.estimates import Estimates, Measured, MeasuredTracks, estimate, rounded_up
 from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_PARTICLES, unfiltered_frames, whole_cells
+from eddies.workflows.learned.source import ModelDefinition
 
 # Memory of a process that holds no field, without and with torch.
 FLOW_PROCESS, TORCH_PROCESS = 100e6, 285e6
@@ -63,16 +65,20 @@ def storage(scene: Scene, stage: str, ranks: int, measured: Measured = {}) -> St
         memory = KERNEL_FIELDS * TABLE_BYTES * tracers.particles / ranks + lists * kernel.neighbors
         return Storage(TORCH_PROCESS + memory, PRODUCT_BYTES + 80 * tracers.cells**2 + 64 * kernel.steps)
     if stage in ("dns", "reconstruct"):
-        tracks, planes = expected.tracks, (scene.tracers_resolving or tracers).planes
-        memory = TORCH_PROCESS + evaluation_memory(tracks.in_frame if tracks else tracers.particles, planes, ranks)
+        tracks, resolved, settings = expected.tracks, tracers, scene.reconstruction
+        if settings is not None:
+            resolved = settings.resolving(tracers, (scene.tracks or tracers).filtered)
+        memory = TORCH_PROCESS + evaluation_memory(
+            tracks.in_frame if tracks else tracers.particles, planes_for(resolved.particles), ranks)
         memory += ROW_BYTES * tracks.in_frame * tracks.frames if tracks else 0.0
         return Storage(memory, tracks_disk(scene, tracks) if stage == "dns" else fields_disk(scene, expected.frames))
-    memory = evaluation_memory(
-        tracers.particles, tracers.planes if scene.needs_resolved_velocity or stage != "train" else 0, ranks)
+    planes = planes_for(tracers.particles)
+    memory = evaluation_memory(tracers.particles, planes if resolves_velocity(scene) or stage != "train" else 0, ranks)
     if model and "pairs" in model.reads:
-        reach = 1 + (simulation.skin if simulation else 0.0)
-        ghosts = tracers.particles * scene.interaction_radius * reach / math.pi if ranks > 1 else 0.0
-        memory += PARTICLE_BYTES * ghosts + NEIGHBOR_BYTES * scene.neighbors * reach**3 * tracers.particles / ranks
+        definition, reach = ModelDefinition.of(scene), 1 + (simulation.skin if simulation else 0.0)
+        ghosts = tracers.particles * definition.radius * reach / math.pi if ranks > 1 else 0.0
+        memory += PARTICLE_BYTES * ghosts
+        memory += NEIGHBOR_BYTES * definition.neighbors * reach**3 * tracers.particles / ranks
     if stage == "train":         # samples of rates, and the history
         training = scene.own_training
         if scene.training and scene.training.field_weight > 0:
@@ -81,11 +87,24 @@ def storage(scene: Scene, stage: str, ranks: int, measured: Measured = {}) -> St
         samples = 48 * min(tracers.particles, TESTED_PARTICLES)
         return Storage(TORCH_PROCESS + evaluations * memory,
                        PRODUCT_BYTES + samples + 100 * (training.steps_in_all if training else 0))
-    memory += TORCH_PROCESS + (CELL_BYTES[True] * tracers.planes**3 / ranks if scene.coarse_cells else 0.0)
+    memory += TORCH_PROCESS + (CELL_BYTES[True] * planes**3 / ranks if scene.coarse_cells else 0.0)
     if stage == "find-step":
         return Storage(memory, PRODUCT_BYTES)
     time = expected.scales and simulation.turnovers * expected.scales["eddy_turnover_time"]
     return Storage(memory, time and rollout_bytes(tracers.particles, rounded_up(time / simulation.frame_interval) + 1))
+
+
+def forces_rollout(scene: Scene) -> bool:
+    """Return whether particles of the rollout are forced."""
+    injection = scene.simulation.injection if scene.simulation else "none"
+    return bool(scene.tracers and scene.tracers.forced) if injection == "truth" else injection != "none"
+
+
+def resolves_velocity(scene: Scene) -> bool:
+    """Return whether the velocity of tracers or of particles of the rollout must be resolved on a grid, because terms
+    of the model read it or particles are forced."""
+    return bool(scene.model and "resolved" in scene.model.reads or scene.tracers and scene.tracers.forced
+                or forces_rollout(scene))
 
 
 def flow_memory(flow: Flow, tracers: Tracers | None, ranks: int) -> float:
@@ -194,13 +213,13 @@ def _limits(scene: Scene, measured: Measured) -> Iterator[tuple[str, int]]:
         return
     yield f"ghost planes of the {tracers.interpolation} splines", spline_ranks(scene.flow.cells, tracers.interpolation)
     if scene.kernel:
-        support = scene.kernel_support
+        support = tracers.radius_of(scene.kernel.neighbors)
         yield (f"slabs of the fields, at least as thick as the kernel's support {support:.3g}",
                thick_slabs(tracers.cells, BOX_LENGTH, support))
     if reconstruction is not None:
         yield _of_the_grid(tracers, 0.0)
         if reconstruction.of_neighbors:
-            yield _of_the_reach(tracers, scene.kernel_support or tracers.radius_of(NEIGHBORS))
+            yield _of_the_reach(tracers, tracers.radius_of(scene.kernel.neighbors if scene.kernel else NEIGHBORS))
     if "train" in scene.stages:
         # The a-priori test interpolates filtered fields to the particles.
         yield "ghost planes of the filtered fields", spline_ranks(tracers.cells, "quintic")
@@ -214,16 +233,17 @@ def _limits(scene: Scene, measured: Measured) -> Iterator[tuple[str, int]]:
                     yield f"[training] truths: {quoted(name)}: {reason}", ranks
     if scene.coarse_cells:
         # In one step a particle crosses at most as many cells as the Courant number.
-        margin = math.ceil(max(scene.time.courant, MOST_COURANT * simulation.finds_step))
+        margin = math.ceil(max(scene.time.courant, ETDRK4.most_courant * simulation.finds_step))
         yield "ghost planes of the coarse grid", spline_ranks(scene.coarse_cells, tracers.interpolation, margin)
         if scene.eulerian and scene.eulerian.start == "particles":
             yield _of_the_grid(tracers, 0.0)
     elif simulation is not None:
-        reads = {*simulation.needs, *(scene.model.reads if "model" in simulation.needs else ())}
-        skin = simulation.skin * scene.interaction_radius
+        reads = {*simulation.form.needs, *(scene.model.reads if "model" in simulation.form.needs else ())}
+        radius = ModelDefinition.of(scene).radius
+        skin = simulation.skin * radius
         if "pairs" in reads:
-            yield _of_the_reach(tracers, scene.interaction_radius + skin)
-        if "resolved" in reads or scene.rollout_is_forced:
+            yield _of_the_reach(tracers, radius + skin)
+        if "resolved" in reads or forces_rollout(scene):
             yield _of_the_grid(tracers, skin / 2)
 
 
@@ -231,20 +251,20 @@ def _of_training(scene: Scene, tracers: Tracers, forced: bool = False) -> Iterat
     """Yield the limits of the training on a ground truth with such tracers."""
     horizons = scene.own_training and scene.own_training.horizons
     if "pairs" in scene.model.reads:
-        yield _of_the_reach(tracers, tracers.radius_of(scene.neighbors))
-    if scene.needs_resolved_velocity or forced or horizons and horizons.energy_weight > 0:
+        yield _of_the_reach(tracers, tracers.radius_of(ModelDefinition.of(scene).neighbors))
+    if resolves_velocity(scene) or forced or horizons and horizons.energy_weight > 0:
         yield _of_the_grid(tracers, 0.0)
 
 
 def _of_the_reach(tracers: Tracers, reach: float) -> tuple[str, int]:
     """Return the limit of particles that interact within the range `reach`."""
     return (f"slabs, at least as thick as the particles' reach {reach:.3g}",
-            thick_slabs(tracers.planes, BOX_LENGTH, reach))
+            thick_slabs(planes_for(tracers.particles), BOX_LENGTH, reach))
 
 
 def _of_the_grid(tracers: Tracers, outside: float) -> tuple[str, int]:
     """Return the limit of the grid of the resolved velocity, if particles leave their slab by the distance `outside`
     (`ResolvedVelocity.on_slabs`)."""
-    planes = tracers.planes
+    planes = planes_for(tracers.particles)
     return ("ghost planes of the resolved velocity",
             spline_ranks(planes, "cubic", margin_for(outside, BOX_LENGTH / planes)))

@@ -15,12 +15,11 @@ from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.exchanges import fluctuations, mean_over_ranks, relative_error
-from eddies.particles.flow_units import ReferenceScales, resolved_wavenumber
+from eddies.particles.flow_units import CELLS_PER_WAVENUMBER, ReferenceScales, planes_for, resolved_wavenumber
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.remembered_velocity import RememberedVelocity
 from eddies.particles.resolved_velocity import WEIGHT, ResolvedVelocity
 from eddies.scene.scene import BOX_LENGTH, Reconstruction, Tracers
-from eddies.scene.sections import CELLS_PER_WAVENUMBER
 
 WEIGHTS = 10.0 ** np.arange(3, -1.1, -0.5)  # weights of the noise in least squares; cross-validation chooses one
 RISE = 1.02             # the search ends when the error exceeds the least error by this factor
@@ -134,7 +133,8 @@ def slabs_for(comm: Comm, tracers: Tracers, resolved: Tracers, filter_width: flo
     """
     highest = resolved_wavenumber(resolved.spacing, filter_width, kolmogorov_length)
     planes = 2 * math.ceil(CELLS_PER_WAVENUMBER / 2 * highest)
-    return SlabDecomposition(comm, BOX_LENGTH, min(max(planes, tracers.planes), resolved.planes))
+    least, most = planes_for(tracers.particles), planes_for(resolved.particles)
+    return SlabDecomposition(comm, BOX_LENGTH, min(max(planes, least), most))
 
 
 def solver_of(slab: SlabDecomposition, reference: Mapping[str, float], weight: float) -> ResolvedVelocity:

@@ -27,7 +27,7 @@ from eddies.parallel.migration import IdOrder, id_block, migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
-from eddies.particles.flow_units import measured_scales
+from eddies.particles.flow_units import measured_scales, planes_for
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.pipeline import STAGES
@@ -99,7 +99,7 @@ def _unfit(settings: Tracks, learned: Sequence[str], wanted: Reconstruction | No
     if settings.viscosity is None and viscous:
         yield (f'[tracks] viscosity: this key is missing, and the term "{viscous[0]}" needs it; give it, or choose '
                "other terms")
-    if simulation is not None and simulation.on_grid:
+    if simulation is not None and simulation.form.on_grid:
         if settings.viscosity is None:
             yield '[tracks] viscosity: this key is missing, and [simulation] method = "eulerian" needs it; give it'
         if (eulerian or Eulerian()).start != "particles":
@@ -125,7 +125,7 @@ def _sections_of(settings: Tracks, learned: bool) -> dict[str, Flow | Tracers]:
                       filter_width=width, turnovers=max(float(tracks.times[-1] / turnover), 1e-6),
                       field_every=settings.field_every)
     viscosity = 0.0 if settings.viscosity is None else settings.viscosity / tracks.unit**2
-    cells, sound = max(tracers.cells, tracers.planes, LEAST_CELLS), settings.sound_speed
+    cells, sound = max(tracers.cells, planes_for(tracers.particles), LEAST_CELLS), settings.sound_speed
     flow = Flow(fluid="incompressible", cells=cells, viscosity=viscosity) if sound is None else Flow(
         fluid="compressible", cells=cells, viscosity=viscosity, sound_speed=sound / tracks.unit)
     return {"flow": flow, "tracers": tracers}

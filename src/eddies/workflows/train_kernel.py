@@ -48,7 +48,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     """
     prepare_torch("cpu", comm)
     settings, directory, provenance = scene.kernel, Path(directory), stage_provenance(scene, "train-kernel")
-    support = scene.kernel_support
+    support = scene.tracers.radius_of(settings.neighbors)
     with open_truth(comm, directory / STAGES["dns"].file, planes=scene.tracers.cells) as truth:
         seen = np.flatnonzero(truth.fields.times <= scene.window * truth.times[-1])
         chosen = evenly(len(seen), KERNEL_FIELDS)

@@ -67,8 +67,8 @@ def rows_of(scene: Scene, runs: Mapping[str, Sequence[Path]], measured: Mapping[
         variant, first = scene.variant.get(name, scene), directories[0]
         simulation = variant.simulation
         found: dict[str, Any] = dict.fromkeys(COLUMNS)
-        found |= {"name": name, "label": variant.label or name, "method": simulation.method, "kind": simulation.title,
-                  "on_grid": simulation.on_grid,
+        found |= {"name": name, "label": variant.label or name, "method": simulation.method,
+                  "kind": simulation.form.title, "on_grid": simulation.form.on_grid,
                   "settings": "; ".join(scene.differences(name)) if scene.variant else ""}
         other = next((each for each in directories if old.get(each / ROLLOUT)), None)
         if name in measured and other is None:

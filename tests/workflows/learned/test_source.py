@@ -65,6 +65,14 @@ def test_a_run_directory_or_its_file_gives_description_weights_and_tables(comm, 
         assert np.array_equal(source.weights["bias"], np.arange(3.0)) and set(source.tables) == {"a_priori"}
 
 
+@pytest.mark.parametrize("overrides, ratio", [((), 1), (("model.neighbors=28",), 0.5)])
+def test_the_radius_of_interaction_is_that_of_the_kernel_unless_the_model_has_its_own(overrides, ratio):
+    given = scene(*overrides)
+    support = given.tracers.radius_of(given.kernel.neighbors)  # holds 56 particles
+    assert ModelDefinition.of(given).radius == pytest.approx(support * ratio ** (1 / 3), rel=1e-12)
+    assert ModelDefinition.of(replace(given, kernel=None, model=None, training=None, simulation=None)).neighbors == 60
+
+
 INPUTS = '["density", "distance", "speed", "approach"]'
 
 

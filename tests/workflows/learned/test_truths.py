@@ -13,6 +13,7 @@ from eddies.io.provenance import product_attributes, product_provenance
 from eddies.io.weights import load_weights
 from eddies.particles.exchanges import relative_error
 from eddies.parallel.reduction import global_sum
+from eddies.particles.flow_units import planes_for
 from eddies.particles.model import FORCING
 from eddies.scene.scene import load_scene
 from eddies.workflows import dns, train
@@ -270,7 +271,7 @@ def test_another_truth_limits_the_number_of_ranks(comm, tmp_path):
     """It has 8 planes, the own one 14. Slabs must hold the radius of interaction, 2.5 planes, and the way of particles
     within the horizons."""
     other = made(comm, tmp_path, "tracers.particles_per_side=4", "training.batch=60", runs=("other",))
-    assert other.tracers.planes == 8
+    assert planes_for(other.tracers.particles) == 8
     place = f'[training] truths: "{tmp_path / "other"}"'
     for model, most, reason in (('{terms=["viscosity"]}', 2, "ghost planes of the resolved velocity"),
                                 ('{preset="paper", neighbors=8}', 2,

@@ -17,6 +17,7 @@ from eddies.flow.navier_stokes import Fluid
 from eddies.flow.statistics import energy_spectrum
 from eddies.flow.tracers import FilteredField, TracerParticles, release
 from eddies.io.checkpoint import Block, Checkpoint, Guard
+from eddies.io.flow_states import restored_modes, saved_modes
 from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments, TrajectoryLayout
 from eddies.io.hdf5 import File, Table, write_table
 from eddies.parallel.migration import IdOrder, id_block, migrate
@@ -296,15 +297,3 @@ def write_spectra(file: File, name: str, rows: str, columns: Mapping[str, ArrayL
 def series_of(name: str) -> dict[str, str]:
     """Map the names of a set's series in `frame_layout` to their names in the ground truth of this set."""
     return {f"{series}{suffix_of(name)}": series for series in ("tracers", "filtered")} | {"unfiltered": "unfiltered"}
-
-
-def saved_modes(grid: SpectralGrid, modes: np.ndarray) -> Block:
-    """Return the modes (..., kz, ky, kx) of a grid for a checkpoint. The axis ky is divided among the ranks."""
-    return Block(modes, int(grid.column_starts[grid.decomposition.rank]), grid.modes, axis=modes.ndim - 2)
-
-
-def restored_modes(grid: SpectralGrid, saved: Checkpoint, dimensions: int, name: str = "modes") -> np.ndarray:
-    """Return this rank's part of the modes (..., kz, ky, kx) that a checkpoint holds under `name`. `dimensions` is the
-    number of dimensions of this array."""
-    start, stop = grid.column_starts[grid.decomposition.rank:][:2]
-    return saved.read(name, int(start), int(stop), axis=dimensions - 2)

@@ -18,8 +18,7 @@ from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import id_block, migrate
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.flow_units import RATES, ReferenceScales
-from eddies.scene.sections import planes_for
+from eddies.particles.flow_units import RATES, ReferenceScales, planes_for
 from eddies.scene.terms import Forcing
 
 CPU = torch.device("cpu")

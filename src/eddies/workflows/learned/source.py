@@ -21,6 +21,7 @@ from eddies.parallel.communicator import Comm
 from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Model, Scene, SceneError, Tracers
+from eddies.scene.sections import NEIGHBORS
 
 # Keys of terms in version 1.0 that later versions lack, with the fixed values that later versions use.
 FORMER = {"force": True, "kernel": "cubic-spline", "background": 0.25}
@@ -34,7 +35,7 @@ class ModelDefinition:
     ----------
     model : [model], the terms and their settings; None if the scene has none.
     tracers : [tracers], particles and filter.
-    neighbors : mean number of particles within the radius of interaction.
+    neighbors : mean number of particles within the radius of interaction; without a key in [model], that of [kernel].
     seed : seed of the initial parameters.
     """
 
@@ -46,13 +47,18 @@ class ModelDefinition:
     @classmethod
     def of(cls, scene: Scene) -> ModelDefinition:
         """Return the definition in a scene."""
-        return cls(scene.model, scene.tracers, scene.neighbors, scene.seed)
+        given = [each.neighbors for each in (scene.model, scene.kernel) if each is not None]
+        return cls(scene.model, scene.tracers, next(filter(None, given), NEIGHBORS), scene.seed)
+
+    @property
+    def radius(self) -> float:
+        """Radius of interaction of pairs."""
+        return self.tracers.radius_of(self.neighbors)
 
     def units(self, scales: ReferenceScales) -> FlowUnits:
         """Return the units for a flow with these scales. The radius of interaction is proportional to the mean particle
         spacing."""
-        radius = self.tracers.radius_of(self.neighbors) * (scales.spacing / self.tracers.spacing)
-        return FlowUnits(scales, radius, self.neighbors, self.seed)
+        return FlowUnits(scales, self.radius * (scales.spacing / self.tracers.spacing), self.neighbors, self.seed)
 
     def describe(self, scales: ReferenceScales) -> dict[str, Any]:
         """Return the description that is stored with the weights: the terms with their settings, the scales, and the

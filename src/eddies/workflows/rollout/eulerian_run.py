@@ -17,6 +17,7 @@ from eddies.flow.navier_stokes import FLUIDS, Fluid
 from eddies.flow.subgrid import Closure, DynamicStress, EddyDamping, SpectralViscosity, StressModel
 from eddies.flow.tracers import FilteredField, TracerParticles
 from eddies.io.checkpoint import Checkpoint
+from eddies.io.flow_states import restored_modes, saved_modes
 from eddies.parallel.migration import migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_set import ParticleSet, as_numpy
@@ -26,7 +27,6 @@ from eddies.scene.terms import Forcing
 from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.time_stepping import ETDRK4
-from eddies.workflows.ground_truth.flow_run import restored_modes, saved_modes
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.saved_particles import restored_rows, saved_rows
 

@@ -80,7 +80,7 @@ def make_method(scene: Scene, step: TimeStep | None, truth: GroundTruth, start: 
     the run directory.
     """
     settings, courant = scene.simulation, scene.time.courant
-    if step is not None and settings.on_grid:
+    if step is not None and settings.form.on_grid:
         courant = step.size
     elif step is not None:
         settings = replace(settings, integrator=step.integrator, step=step.size, step_from=None, confirmed_on=None)
@@ -91,7 +91,7 @@ def make_method(scene: Scene, step: TimeStep | None, truth: GroundTruth, start: 
             return kind(replace(scene, simulation=settings), truth, start, directory, truth.device)
     comm, trained = truth.decomposition.comm, directory / STAGES["train"].file
     forcing = forcing_of(settings.injection, scene.forcing, truth)
-    if settings.on_grid:
+    if settings.form.on_grid:
         eulerian, rates = scene.eulerian or Eulerian(), None
         if eulerian.form.learned:
             rates = load_weights(comm, trained, "model").weights[f"terms.{scene.model.damping}"]
@@ -99,7 +99,7 @@ def make_method(scene: Scene, step: TimeStep | None, truth: GroundTruth, start: 
         return EulerianRun(eulerian, fluid, truth, start, settings.longest_step, courant, scene.tracers.interpolation)
     definition, seen = ModelDefinition.of(scene), None
     model = LagrangianModel({}, definition.units(truth.scales))
-    if "model" in settings.needs:
+    if "model" in settings.form.needs:
         stored = load_weights(comm, trained, "model")
         model = trained_model(definition, stored, truth.scales, comm)
         seen = FeatureRange(**stored.tables["feature_range"]) if model.networks else None

@@ -125,7 +125,7 @@ class ParticleSpectra:
 
     @cached_property
     def _resolution(self) -> ResolvedVelocity:
-        cells = max(2 * round(0.875 * self.length / self.scales.spacing), 3)  # as `Tracers.planes`; splines need 3
+        cells = max(2 * round(0.875 * self.length / self.scales.spacing), 3)  # as `planes_for`; splines need 3
         found = ResolvedVelocity.on_slabs(SlabDecomposition(self.alone, self.length, cells), self.scales,
                                           dtype=torch.float32)
         found.most_iterations = MOST_ITERATIONS

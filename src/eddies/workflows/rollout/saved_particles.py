@@ -13,13 +13,13 @@ import numpy as np
 import torch
 
 from eddies.io.checkpoint import Block, Checkpoint
+from eddies.io.flow_states import restored_modes, saved_modes
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition, block_starts
 from eddies.particles.integrators import Integrator
 from eddies.particles.particle_set import ParticleSet, as_numpy
-from eddies.workflows.ground_truth.flow_run import restored_modes, saved_modes
 
 MEMORY, BUILT_AT = "memory ", "built at"
 

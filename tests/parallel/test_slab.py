@@ -1,8 +1,23 @@
+"""Slabs: which rank owns what, and the transpose between planes and columns."""
+
 import numpy as np
 import pytest
 
-from eddies.parallel.slab import block_starts
-from eddies.parallel.transpose import Transpose
+from eddies.parallel.slab import SlabDecomposition, Transpose, block_starts
+
+
+def test_blocks_differ_by_at_most_one():
+    for total, parts, starts in ((10, 3, [0, 4, 7, 10]), (2, 3, [0, 1, 2, 2]), (0, 2, [0, 0, 0])):
+        assert block_starts(total, parts).tolist() == starts
+
+
+@pytest.mark.mpi(1, 3)
+def test_every_coordinate_has_the_owner_whose_bounds_hold_it(comm):
+    slab = SlabDecomposition(comm, 2 * np.pi, 7)
+    z = np.random.default_rng(1).uniform(0, slab.length, 1000)
+    assert np.array_equal(slab.owner_of(z) == comm.rank, (z >= slab.lower) & (z < slab.upper))
+    assert slab.owner_of(np.nextafter(slab.length, 0)) == comm.size - 1
+    assert slab.owner_of(slab.lower) == comm.rank
 
 
 @pytest.mark.mpi(1, 2, 3)
