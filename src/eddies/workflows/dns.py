@@ -32,13 +32,14 @@ from eddies.workflows.ground_truth.flow_run import FlowRun, TracerRun, frame_lay
 from eddies.workflows.ground_truth.frame_counts import unfiltered_frames
 from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
 from eddies.workflows.problems import check_span
-from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, stage_fingerprint, stage_provenance
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 
 log = logging.getLogger("eddies")
 
 
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
-    """Simulate the flow of a scene and write ground_truth.h5: statistics and, with [tracers], frames and fields.
+    """Simulate the flow of a scene and write ground_truth.h5: statistics and, with [tracers], frames and fields. With
+    [tracks] the ground truth is that of the measured tracks (`tracks.run`).
 
     With sets of tracers, each set gets its own ground truth SET/ground_truth.h5, as if it were the only set. The ground
     truth of the run directory then has no tracers.
@@ -50,9 +51,14 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     Raises SceneError if the checkpoint is later than the end of the run, and Stopped, after a checkpoint, if `stop`
     requests it.
     """
+    if scene.tracks is not None:
+        from eddies.workflows import tracks  # imports torch
+        tracks.run(scene, comm, directory, stop)
+        return
     directory, sets = Path(directory), scene.tracer_sets
-    product, course = directory / STAGES["dns"].file, stage_fingerprint(scene, "dns", DURATION_KEYS["dns"])
-    guard = Guard(comm, directory / STAGES["dns"].checkpoints, course, stop)
+    stage = STAGES["dns"]
+    product, course = directory / stage.file, stage_fingerprint(scene, "dns", stage.duration)
+    guard = Guard(comm, directory / stage.checkpoints, course, stop)
     provenance = {**stage_provenance(scene, "dns"), "course": course, "duration": scene.duration}
     saved, kept = checkpoint_to_continue(guard, product, course)
     if saved is not None and kept and scene.tracers is not None:

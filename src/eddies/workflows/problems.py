@@ -208,8 +208,8 @@ def directory_problems(stages: Sequence[str], comm: Comm, directory: Path) -> li
             return [f"{directory}: cannot be written; change its permissions, or choose another directory"]
         found = []
         for stage in [STAGES[name] for name in stages]:
-            file, folder = (stage.file, stage.checkpoints) if stage.product is not None else (None, "report")
-            for name, is_directory, makes in ((file, True, "writes a file"), (folder, False, "makes a directory")):
+            for name, is_directory, makes in ((stage.file, True, "writes a file"),
+                                              (stage.folder, False, "makes a directory")):
                 if name and (directory / name).exists() and (directory / name).is_dir() == is_directory:
                     found.append(f"{directory / name}: is a {'directory' if is_directory else 'file'}, and `eddies "
                                  f"{stage.name}` {makes} of this name; move it away, or choose another directory")

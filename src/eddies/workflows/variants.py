@@ -18,14 +18,13 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from eddies.pipeline import STAGES
+from eddies.pipeline import MAKER_OF, STAGES
 from eddies.scene.scene import REALISATION, Scene
 from eddies.workflows.run_directory.fingerprints import set_files, stage_fingerprint
 
-# Stages whose products variants share if their settings agree.
-SHARED = ("dns", "train-kernel", "reconstruct")
+SHARED = tuple(stage.name for stage in STAGES.values() if stage.shared)
 # Stages that make a product.
-MAKING = tuple(stage.name for stage in STAGES.values() if stage.product is not None)
+MAKING = tuple(stage.name for stage in MAKER_OF.values())
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.hdf5 import ProductError, create_product
 from eddies.pipeline import STAGES
 from eddies.scene.scene import load_scene
-from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, stage_fingerprint, stage_provenance
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 from eddies.workflows.run_directory.work import WouldReplaceWork, find_work
 from tests.small_scene import TINY
 
@@ -72,7 +72,7 @@ def test_what_is_found_decides_what_a_run_does(comm, tmp_path, scene, product, c
     course = "course of the product"
     if FOUND[product]:
         other = load_scene(TINY, [FOUND[product]])
-        course = stage_fingerprint(other, "dns", DURATION_KEYS["dns"])
+        course = stage_fingerprint(other, "dns", STAGES["dns"].duration)
         with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", stage_provenance(other, "dns") | {
                 "course": course, "duration": other.duration}):
             pass
@@ -80,7 +80,7 @@ def test_what_is_found_decides_what_a_run_does(comm, tmp_path, scene, product, c
         (tmp_path / "ground_truth.h5").write_bytes(b"damaged")
     if CHECKPOINTS[checkpoints]:
         of = load_scene(TINY, [CHECKPOINTS[checkpoints]])
-        CheckpointDirectory(comm, tmp_path / "checkpoints", stage_fingerprint(of, "dns", DURATION_KEYS["dns"])).write(
+        CheckpointDirectory(comm, tmp_path / "checkpoints", stage_fingerprint(of, "dns", STAGES["dns"].duration)).write(
             5, {"a": 1})
     work = find_work(["dns"], scene, tmp_path)
     assert (work.actions["dns"].start, work.actions["dns"].drops) == (start, drops)
@@ -94,7 +94,7 @@ def test_what_is_found_decides_what_a_run_does(comm, tmp_path, scene, product, c
 
 @pytest.mark.mpi(1)
 def test_the_last_state_of_a_product_is_not_listed_beside_it(comm, tmp_path, scene):
-    course = stage_fingerprint(scene, "dns", DURATION_KEYS["dns"])
+    course = stage_fingerprint(scene, "dns", STAGES["dns"].duration)
     CheckpointDirectory(comm, tmp_path / "checkpoints", course).write(9, {})
     provenance = stage_provenance(scene, "dns") | {"course": course, "duration": scene.duration}
     with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", provenance):

@@ -17,13 +17,9 @@ from eddies.scene.sections import SET_KEYS
 from eddies.scene.values import import_paths
 
 
-# The keys that only set the duration of a stage. If nothing else differs, the stage can continue from a checkpoint.
-DURATION_KEYS = {"dns": ("tracers.turnovers", "time.duration")}
-
-
 def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> str:
     """Return the SHA-256 checksum of all inputs of a stage's product. `without` names keys to leave out, such as
-    DURATION_KEYS.
+    `Stage.duration`.
 
     The inputs are the settings of the stage and of the stages on which it depends, the content of the files from which
     the flow, the weights and the step come, the source code of the user's classes, and the fingerprints of ground

@@ -29,7 +29,7 @@ from eddies.scene.layers import dotted
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Scene, Simulation
 from eddies.scene.sections import CONVERGED
-from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, set_files, stage_fingerprint
+from eddies.workflows.run_directory.fingerprints import set_files, stage_fingerprint
 
 SECONDS = "stage_seconds.json"
 FAILURE = "failure.txt"  # the error of a failed variant
@@ -116,7 +116,7 @@ def _work_of(stage: Stage, scene: Scene, directory: Path,
     origin = product_provenance(directory / stage.file)
     checkpoints = checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
     fingerprints = [fingerprint for _, fingerprint in checkpoints]
-    continued = stage_fingerprint(scene, stage.name, DURATION_KEYS.get(stage.name, ()))
+    continued = stage_fingerprint(scene, stage.name, stage.duration)
     sets = _other_sets(scene, directory) if stage.name == "dns" else {}
     product = _product_state(stage, scene, directory / stage.file, origin, continued)
     if sets and product == "same":  # not all its parts are there
