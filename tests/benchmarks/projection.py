@@ -17,7 +17,7 @@ import numpy as np
 from performance import INTERPOLATED, MODELS, TRANSFORMED, scene_of, shells_of
 
 from eddies.scene.scene import BOX_LENGTH, Scene
-from eddies.workflows.resources import most_ranks
+from eddies.workflows.estimates import most_ranks
 
 SIDES, TABLE_CORES, MOST_CORES = (64, 128, 256, 512), (16, 64, 256, 1024, 4096), 4096
 # The cluster: cores of a node; bytes a second of a rank within its node, and of a node to all others; seconds of a

@@ -26,7 +26,7 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent / "workflows"), str(HERE.parents[1])]
 
 from test_dns_restart import SPLIT  # noqa: E402
-from test_train_restart import SHORT  # noqa: E402
+from test_train import SHORT  # noqa: E402
 
 from eddies.io.checkpoint import CheckpointDirectory  # noqa: E402
 from eddies.pipeline import STAGES  # noqa: E402

@@ -88,7 +88,7 @@ def check_words(path, dataset):
 def test_what_check_foresees_is_what_was_run(run_directory):
     from eddies.workflows.estimates import estimate
     from eddies.workflows.ground_truth.frame_counts import unfiltered_frames
-    from eddies.workflows.resources import rollout_bytes, storage, trajectory_bytes
+    from eddies.workflows.estimates import rollout_bytes, storage, trajectory_bytes
     scene = load_scene(TINY, CHANGES)
     with h5py.File(run_directory / "rollout.h5") as file:
         stored = len(file["particles/model/time"])

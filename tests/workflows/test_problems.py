@@ -15,7 +15,7 @@ from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 from eddies.scene.terms import FilteredEquations, StepUnits
 from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.problems import check_ground_truth, convenient, memory_of_node, problems
-from eddies.workflows.resources import storage
+from eddies.workflows.estimates import storage
 from eddies.workflows.tracks import with_tracks
 from eddies.workflows.variants import steps
 from tests.bad_scenes import INFEASIBLE

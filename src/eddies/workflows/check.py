@@ -9,9 +9,8 @@ from typing import Any
 
 from eddies.parallel.communicator import Comm
 from eddies.scene.scene import Scene, SceneError
-from eddies.workflows.estimates import estimate, measure
+from eddies.workflows.estimates import estimate, in_units, measure, most_disk, most_ranks, storage
 from eddies.workflows.problems import directory_problems, free_disk_at, memory_of_node, problems
-from eddies.workflows.resources import in_units, most_disk, most_ranks, storage
 from eddies.workflows.variants import steps
 
 log = logging.getLogger("eddies")

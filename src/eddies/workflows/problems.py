@@ -15,8 +15,8 @@ from pathlib import Path
 
 from eddies.clock import SAME
 from eddies.errors import UserError
-from eddies.import_path import is_path
 from eddies.flow.stability import REMEDIES, limits_of_step
+from eddies.import_path import is_path
 from eddies.io.hdf5 import open_product
 from eddies.io.provenance import product_provenance
 from eddies.io.trajectories import Trajectory
@@ -28,12 +28,11 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import (BOX_LENGTH, Flow, Forcing, Initial, Model, Reconstruction, Scene, SceneError,
                                 Simulation, Time, Tracers, Tracks, Training)
 from eddies.scene.terms import StepUnits
-from eddies.workflows.estimates import Estimates, Measured, estimate, expected_scales
+from eddies.workflows.estimates import (Estimates, Measured, Storage, estimate, expected_scales, in_units, most_disk,
+                                        most_ranks, storage)
 from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.ground_truth.scene_flow import given_spectrum, stored_states
-from eddies.workflows.learned.seen import seen_by, seen_flows, start_within_training
-from eddies.workflows.learned.source import ModelDefinition, read_source
-from eddies.workflows.resources import Storage, in_units, most_disk, most_ranks, storage
+from eddies.workflows.learned.source import ModelDefinition, read_source, seen_by, seen_flows, start_within_training
 from eddies.workflows.variants import Step
 
 LARGEST_MACH = 0.3           # turbulent Mach number; the relative density fluctuations are about the square of it
@@ -136,7 +135,7 @@ def _infeasible(step: Step, comm: Comm, made: Collection[Path], measured: Measur
     limits = most_ranks(scene.ground_truth_alone if set(stages) == {"dns"} else scene, measured)
     yield from rank_problems(limits, comm.size)
     if "train" in stages and scene.model.path is None and scene.training.truths is not None:
-        from eddies.workflows.learned.truths import truth_problems  # imports torch
+        from eddies.workflows.learned.training_data import truth_problems  # imports torch
         yield from truth_problems(scene.training, tracers, scene.model.reads, truth, comm)
 
 

@@ -20,11 +20,11 @@ from eddies.particles.flow_units import allowed_step
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.model import LagrangianModel
 from eddies.particles.moment import Moment, between
-from eddies.particles.particle_set import ParticleSet
+from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.scene.scene import Simulation
+from eddies.workflows.ground_truth.flow_run import restored_modes, restored_rows, saved_modes, saved_rows
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import particles_for
-from eddies.workflows.rollout.saved_particles import particle_state, restored_particles
 
 log = logging.getLogger("eddies")
 
@@ -34,6 +34,8 @@ log = logging.getLogger("eddies")
 RUNAWAY_SPEED, RUNAWAY_DENSITY = 30.0, 300.0
 # Columns of the table on the solves for the resolved velocity; see `ParticleRun.series`.
 SOLVES = "solves", "iterations", "most_iterations", "residual", "not_converged"
+# Names of columns in checkpoints: prefix of the rates that an integrator keeps, and positions of the neighbour list.
+MEMORY, BUILT_AT = "memory ", "built at"
 
 
 class ParticleRun:
@@ -170,13 +172,52 @@ class ParticleRun:
         return tables if self.dynamics.resolution is None else {**tables, "closure": self._solves}
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state for a checkpoint; collective. Call it after the frames of a step, before the next step."""
-        return {**particle_state(self.particles, self.integrator), "series": {
-            "outside_training": self._shares_outside, "closure": self._solves}}
+        """Return the state for a checkpoint; collective. Call it after the frames of a step, before the next step.
+
+        It has the particles that the integrator returned last, the rates that the integrator keeps, the positions at
+        which the neighbour list was built, start values for the next solves, and the tables.
+        """
+        dynamics, resolution = self.dynamics, self.dynamics.resolution
+        columns = self.particles.to_numpy() | {
+            MEMORY + name: as_numpy(rate) for name, rate in self.integrator.memory.items()}
+        built_at = dynamics.built_at(self.particles)
+        if built_at is not None:
+            columns[BUILT_AT] = as_numpy(built_at)
+        state = {"time": dynamics.time, "evaluations": dynamics.evaluations, **saved_rows(self.comm, columns),
+                 "series": {"outside_training": self._shares_outside, "closure": self._solves}}
+        if resolution is not None:
+            values = resolution.state_dict()
+            solves = [(int(iterations), float(residual), bool(converged))
+                      for iterations, residual, converged in resolution.solves]
+            state |= {"closure": {"times": values["times"].tolist(), "means": values["means"].tolist(),
+                                  "speed": float(values["speed"]), "solves": solves},
+                      "modes": saved_modes(resolution.grid.spectral, as_numpy(values["modes"]))}
+        return state
 
     def load_state_dict(self, saved: Checkpoint) -> None:
-        """Restore a state of `state_dict`; collective. The continued run is exact on the same number of ranks."""
-        self.particles = restored_particles(saved, self.integrator, self.particles.id.device)
+        """Restore a state of `state_dict`; collective.
+
+        The continued run is exact on the same number of ranks. On another number the particles move to their slabs, and
+        the neighbour list is built again.
+        """
+        dynamics, resolution, device = self.dynamics, self.dynamics.resolution, self.particles.id.device
+        state = {"time": torch.tensor(saved["time"], dtype=torch.float64)}
+        if resolution is not None:
+            closure = saved["closure"]
+            state |= {"modes": torch.from_numpy(restored_modes(resolution.grid.spectral, saved, 6)),
+                      "times": torch.tensor(closure["times"], dtype=torch.float64),
+                      "means": torch.tensor(closure["means"], dtype=torch.float64).reshape(-1, 3),
+                      "speed": torch.tensor(closure["speed"], dtype=torch.float64)}
+            resolution.solves = [tuple(solve) for solve in closure["solves"]]
+        dynamics.load_state_dict(state)
+        dynamics.evaluations = saved["evaluations"]
+        columns, same = restored_rows(dynamics.decomposition, saved)
+        self.particles = ParticleSet.from_numpy(columns, device)
+        if same and BUILT_AT in columns:
+            dynamics.rebuild(self.particles, torch.from_numpy(columns[BUILT_AT]).to(device))
+        memory = {name.removeprefix(MEMORY): torch.from_numpy(column).to(device) for name, column in columns.items()
+                  if name.startswith(MEMORY)}
+        self.integrator.restore(self.particles if memory else None, memory)
         self._shares_outside, self._solves = (saved["series"][name] for name in ("outside_training", "closure"))
 
     def description(self) -> dict[str, float | str]:

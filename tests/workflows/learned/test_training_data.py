@@ -11,19 +11,18 @@ from mpi4py import MPI
 
 from eddies.io.provenance import product_attributes, product_provenance
 from eddies.io.weights import load_weights
-from eddies.particles.exchanges import relative_error
 from eddies.parallel.reduction import global_sum
+from eddies.particles.exchanges import relative_error
 from eddies.particles.model import FORCING
 from eddies.scene.scene import load_scene
 from eddies.workflows import dns, train
+from eddies.workflows.estimates import most_ranks
 from eddies.workflows.ground_truth.frame_counts import last_seen, rollout_start
 from eddies.workflows.learned.source import ModelDefinition
-from eddies.workflows.learned.training_data import load_frame, model_for, training_data
-from eddies.workflows.learned.truths import open_truths, truth_problems
+from eddies.workflows.learned.training_data import load_frame, model_for, open_truths, training_data, truth_problems
 from eddies.workflows.problems import problems, rank_problems
-from eddies.workflows.resources import most_ranks
-from eddies.workflows.variants import steps
 from eddies.workflows.rollout.method import forcing_of, make_method
+from eddies.workflows.variants import steps
 from tests.changed_product import changed
 from tests.workflows.small_rollout import with_method
 
