@@ -155,14 +155,14 @@ def test_tracks_need_what_their_file_holds(comm, tmp_path):
     scene = tracks.with_tracks(load_scene(folder / "case.toml"), comm)
     measured, _ = measure([scene], comm)
     found = estimate(scene, measured)
-    assert (found.tracks.in_frame, found.tracks.complete, found.frames) == (600, 300, 10)
+    assert (found.tracks.mean_count, found.tracks.complete, found.frames) == (600, 300, 10)
     assert scene.tracers.particles > 3 * 600  # that many would fill the cube
     assert storage(scene, "dns", comm.size, measured).memory > storage(scene, "dns", 2 * comm.size, measured).memory
     tracks.run(scene, comm, folder)
     size = comm.bcast((folder / "ground_truth.h5").stat().st_size)
     assert storage(scene, "dns", comm.size, measured).kept == pytest.approx(size, rel=0.2)
     with h5py.File(folder / "ground_truth.h5") as file:
-        assert file["tracks"].attrs["mean_count"] == found.tracks.in_frame
+        assert file["tracks"].attrs["mean_count"] == found.tracks.mean_count
 
 
 def test_the_disk_of_the_worst_moment():

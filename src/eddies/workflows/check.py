@@ -65,7 +65,7 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
                       "scratch": needed[0].scratch, "most_ranks": ranks,
                       "least_memory": max(storage(each, stage, ranks, measured).memory for each in scenes)})
         needs += needed
-    particles = tracers and (round(expected.tracks.in_frame) if expected.tracks else tracers.particles)
+    particles = tracers and (round(expected.tracks.mean_count) if expected.tracks else tracers.particles)
     return {
         "scene": scene.name, "stages": list(scene.stages_of_all), "cells": scene.flow.cells,
         "largest_wavenumber": scene.flow.largest_wavenumber,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from eddies.clock import Clock, ladder_step
 from eddies.cores import threads
@@ -31,21 +31,14 @@ from eddies.spectral.interpolation import margin_for, spline_ranks
 from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_PARTICLES, unfiltered_frames, whole_cells
 from eddies.workflows.ground_truth.scene_flow import build_fluid, initial_state
 
+if TYPE_CHECKING:
+    from eddies.workflows.ground_truth.track_frames import TrackFrames  # imports scipy
+
 DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
 PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) divided by u' in turbulence; one component is at most about 4 u'
 
 #: What the files of scenes hold, by [flow] and [initial]: scales of an initial flow and its `peak_speed`, or tracks.
 Measured = Mapping[tuple[Flow, Initial], Any]
-
-
-@dataclass(frozen=True)
-class MeasuredTracks:
-    """The tracks in the file of [tracks]: their mean number in a frame, the number of tracks in all frames, and the
-    number of frames."""
-
-    in_frame: float
-    complete: int
-    frames: int
 
 
 def measure(scenes: Iterable[Scene], comm: Comm) -> tuple[Measured, list[str]]:
@@ -60,8 +53,7 @@ def measure(scenes: Iterable[Scene], comm: Comm) -> tuple[Measured, list[str]]:
         try:
             if scene.tracks is not None:
                 from eddies.workflows.ground_truth.track_frames import TrackFrames  # imports scipy
-                tracks = TrackFrames(comm, scene.tracks)
-                found[key] = MeasuredTracks(tracks.mean_count, tracks.complete, len(tracks.times))
+                found[key] = TrackFrames(comm, scene.tracks)
             elif scene.initial.path is not None:
                 fluid = build_fluid(scene.flow, None, comm)
                 state = initial_state(scene.initial, scene.seed, fluid)
@@ -104,7 +96,7 @@ class Estimates:
     run_time: float | None
     frames: int | None
     steps: int | None
-    tracks: MeasuredTracks | None
+    tracks: TrackFrames | None
 
 
 def estimate(scene: Scene, measured: Measured = {}) -> Estimates:
@@ -123,7 +115,7 @@ def estimate(scene: Scene, measured: Measured = {}) -> Estimates:
                          for part in (scene.spin_up, tracers))
     frames = run_time = steps = None
     if scene.tracks is not None:
-        frames = tracks and tracks.frames
+        frames = tracks and len(tracks.times)
     elif followed is not None:
         frames = max(rounded_up(followed / tracers.frame_interval), 1) + 1 if tracers else 0
     if spin_up is not None and followed is not None:
@@ -226,8 +218,8 @@ def storage(scene: Scene, stage: str, ranks: int, measured: Measured = {}) -> St
         return Storage(TORCH_PROCESS + memory, PRODUCT_BYTES + 80 * tracers.cells**2 + 64 * kernel.steps)
     if stage in ("dns", "reconstruct"):
         tracks, planes = expected.tracks, (scene.tracers_resolving or tracers).planes
-        memory = TORCH_PROCESS + evaluation_memory(tracks.in_frame if tracks else tracers.particles, planes, ranks)
-        memory += ROW_BYTES * tracks.in_frame * tracks.frames if tracks else 0.0
+        memory = TORCH_PROCESS + evaluation_memory(tracks.mean_count if tracks else tracers.particles, planes, ranks)
+        memory += ROW_BYTES * tracks.mean_count * len(tracks.times) if tracks else 0.0
         return Storage(memory, tracks_disk(scene, tracks) if stage == "dns" else fields_disk(scene, expected.frames))
     memory = evaluation_memory(
         tracers.particles, tracers.planes if scene.needs_resolved_velocity or stage != "train" else 0, ranks)
@@ -297,15 +289,15 @@ def trajectory_bytes(flow: Flow, tracers: Tracers, frames: int, whole: int) -> i
     return size
 
 
-def tracks_disk(scene: Scene, tracks: MeasuredTracks | None) -> float | None:
+def tracks_disk(scene: Scene, tracks: TrackFrames | None) -> float | None:
     """Return the disk space of the ground truth of measured tracks: filtered fields, and frames of the particles of
     models or, without models, of the tracks that are present in all frames."""
     if tracks is None:
         return None
-    tracers, learned = scene.tracers, any((scene.kernel, scene.model, scene.simulation))
-    particles = (tracers.particles if learned else tracks.complete) * tracks.frames
+    tracers, learned, frames = scene.tracers, any((scene.kernel, scene.model, scene.simulation)), len(tracks.times)
+    particles = (tracers.particles if learned else tracks.complete) * frames
     return (PRODUCT_BYTES + particles * (FRAME_BYTES + 8 * scene.flow.compressible)
-            + 12 * tracers.cells**3 * math.ceil(tracks.frames / tracers.field_every))
+            + 12 * tracers.cells**3 * math.ceil(frames / tracers.field_every))
 
 
 def fields_disk(scene: Scene, frames: int | None) -> float | None:

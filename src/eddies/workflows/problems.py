@@ -9,14 +9,12 @@ import math
 import os
 import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from eddies.clock import SAME
 from eddies.errors import UserError
 from eddies.flow.stability import REMEDIES, limits_of_step
-from eddies.import_path import is_path
 from eddies.io.hdf5 import open_product
 from eddies.io.provenance import product_provenance
 from eddies.io.trajectories import Trajectory
@@ -28,7 +26,7 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import (BOX_LENGTH, Flow, Forcing, Initial, Model, Reconstruction, Scene, SceneError,
                                 Simulation, Time, Tracers, Tracks, Training)
 from eddies.scene.terms import StepUnits
-from eddies.workflows.estimates import (Estimates, Measured, Storage, estimate, expected_scales, in_units, most_disk,
+from eddies.workflows.estimates import (Estimates, Measured, Storage, estimate, in_units, most_disk,
                                         most_ranks, storage)
 from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.ground_truth.scene_flow import given_spectrum, stored_states
@@ -251,7 +249,6 @@ def _warnings(step: Step, made: Collection[Path], measured: Measured) -> Iterato
     scene, stages, expected = step.scene, step.stages, estimate(step.scene, measured)
     tracers, model, training, simulation = scene.tracers, scene.model, scene.own_training, scene.simulation
     if "dns" in stages and scene.tracks is None:
-        yield from inviscid_turbulence(scene.flow, scene.initial, scene.forcing)
         if expected.scales is not None:
             yield from resolution(scene.flow, expected.scales)
             yield from laminar_flow(scene.flow, expected.scales)
@@ -295,37 +292,17 @@ def _start_within_training(step: Step, learned: dict[Path, dict[str, float]]) ->
     return [] if found is None else [found]
 
 
-def inviscid_turbulence(flow: Flow, initial: Initial, forcing: Forcing | None) -> Iterator[str]:
-    """Yield a warning if nothing dissipates the energy of a turbulent or forced flow."""
-    forced = forcing is not None and forcing.injection_rate > 0
-    if flow.viscosity > 0 or is_path(flow.fluid) or not (forced or initial.flow.turbulent):
-        return
-    viscosity = (KMAX_ETA[0] / flow.largest_wavenumber) ** (4 / 3) * (
-        expected_scales(replace(flow, viscosity=1.0), initial, forcing)["dissipation_rate"] ** (1 / 3))
-    fate = ("the energy of [forcing] is never dissipated, so the flow has no stationary state" if forced else
-            "no energy is dissipated, so it gathers at the smallest scales of the grid")
-    yield (f"[flow] viscosity = 0: {fate}, and k_max eta, which tells whether a grid resolves the smallest scales, has "
-           f"no value; raise viscosity to {at_least(viscosity)}{', or remove [forcing]' if forced else ''}")
-
-
 def resolution(flow: Flow, scales: Mapping[str, float]) -> Iterator[str]:
     """Yield a warning if the grid is too coarse for the dissipation, or much finer than necessary."""
     reached, (least, most) = scales["kmax_eta"], KMAX_ETA
-    cells = convenient(math.ceil(3 * least / scales["kolmogorov_length"]) + 1)
+    cells = 2 * math.ceil((3 * math.ceil(least / scales["kolmogorov_length"]) + 1) / 2)
     if reached < least * (1 - 1e-3):
         viscosity = (least / flow.largest_wavenumber) ** (4 / 3) * scales["dissipation_rate"] ** (1 / 3)
         yield (f"[flow] cells = {flow.cells}: k_max eta is about {reached:.2g}, below {least:g}, so that the "
                f"dissipation is not resolved; raise cells to {cells}, or viscosity to {at_least(viscosity)}")
     elif reached > most:
         yield (f"[flow] cells = {flow.cells}: k_max eta is about {reached:.2g}, but 1 to 2 resolve the dissipation: a "
-               f"step costs {(reached / 2)**3:.0f} times as much as necessary; lower cells to {convenient(2 * cells)}")
-
-
-def convenient(cells: int) -> int:
-    """Return an even number, equal to `cells` or slightly larger, without prime factors above 7. Transforms on other
-    grids are slower."""
-    factors = [2 * 3**threes * 5**fives * 7**sevens for threes in range(4) for fives in range(4) for sevens in range(2)]
-    return min(factor << (-(-cells // factor) - 1).bit_length() for factor in factors)
+               f"step costs {(reached / 2)**3:.0f} times as much as necessary; lower cells to {2 * cells}")
 
 
 def compressibility(flow: Flow, speed: float | None) -> Iterator[str]:

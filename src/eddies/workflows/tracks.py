@@ -5,10 +5,9 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -142,7 +141,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     """
     tracks, viscosity = TrackFrames(comm, scene.tracks), scene.flow.viscosity
     follows = scene.tracers.filtered and not scene.tracks.filtered
-    flows = FittedFlows.of(tracks, scene.tracers, scene.tracks.filtered, viscosity, follows)
+    flows = FittedFlows(tracks, scene.tracers, scene.tracks.filtered, viscosity, follows)
     with create_product(comm, Path(directory) / STAGES["dns"].file, "ground_truth",
                         stage_provenance(scene, "dns")) as file:
         paths, rows, spectra = write_frames(file, flows, tracks, scene.tracers, viscosity, follows, stop)
@@ -204,48 +203,36 @@ def write_frames(file: File, flows: FittedFlows, tracks: TrackFrames, tracers: T
     return paths, rows, dict(zip(("time", "energy", "filtered"), map(np.array, zip(*spectra))))
 
 
-@dataclass(frozen=True)
 class FittedFlows:
-    """The velocity fields of measured tracks, by one method for all frames.
+    """The velocity fields of measured tracks, by one method for all frames, which the first frame determines. The
+    constructor is collective.
 
     slab, grid, method: the slabs, the grid, and the method that finds the modes of a frame. reference: the scales of
     the flow in the first frame. weight, error: the weight of the noise, and the error at left-out tracks, NaN if it was
     not measured. filtered, filter_width: as in `FrameFlow`.
     """
 
-    slab: SlabDecomposition
-    grid: FourierGrid
-    method: Any
-    reference: dict[str, float]
-    weight: float
-    error: float
-    filtered: bool
-    filter_width: float
-
-    @classmethod
-    def of(cls, tracks: TrackFrames, tracers: Tracers, filtered: bool, viscosity: float,
-           follows: bool) -> FittedFlows:
-        """Choose the method by the first frame; collective."""
+    def __init__(self, tracks: TrackFrames, tracers: Tracers, filtered: bool, viscosity: float, follows: bool) -> None:
         settings = Reconstruction(method="memory" if follows and viscosity > 0 else "least-squares")
+        self.filtered, self.filter_width = filtered, tracers.filter_width
         own = tracers.with_count(count_for(tracks.spacing))
         known = {"filter_width": tracers.filter_width, "spacing": tracers.spacing, "density_mean": 1.0,
                  "viscosity": viscosity,
                  **measured_scales(tracks.comm, tracks.shared(0, 1), tracks.shared(1, 0), tracks.times[1])}
         width = tracers.filter_width if filtered else NO_FILTER * tracks.spacing
-        found = {"kolmogorov_length": 0.0} | known
+        self.reference = {"kolmogorov_length": 0.0} | known
         # The first pass does not know the Kolmogorov length. The prior of the second pass uses that of the first pass.
         for resolved in (own, settings.resolving(own, filtered))[:2 if viscosity > 0 else 1]:
-            slab = slabs_for(tracks.comm, own, resolved, width, found["kolmogorov_length"])
-            particles = particles_on(slab, tracks.frame(0))
-            make = partial(solver_of, slab, found | {"spacing": resolved.spacing, "filter_width": width})
-            solver, weight, error = best_solver(particles, make, uniform=tracks.uniform)
-            first = UniformMethod(solver) if tracks.uniform else LeastSquaresMethod(solver)
-            flow = FrameFlow(solver.grid, first.of(particles, 0.0), particles, filtered, tracers.filter_width)
-            found = flow.scales(viscosity) | known  # velocity_rms is that of the particles
-        # A memory is of an unfiltered flow: G = 1.
-        method = UniformMethod(solver) if tracks.uniform else solving_method(
-            settings, solver, viscosity, torch.ones_like(solver.grid.shell), weight)
-        return cls(slab, solver.grid, method, found, weight, error, filtered, tracers.filter_width)
+            self.slab = slabs_for(tracks.comm, own, resolved, width, self.reference["kolmogorov_length"])
+            make = partial(solver_of, self.slab, self.reference | {"spacing": resolved.spacing, "filter_width": width})
+            solver, self.weight, self.error = best_solver(particles_on(self.slab, tracks.frame(0)), make,
+                                                          uniform=tracks.uniform)
+            self.grid = solver.grid
+            self.method = UniformMethod(solver) if tracks.uniform else LeastSquaresMethod(solver)
+            # The velocity_rms is that of the particles.
+            self.reference = self.at(tracks.frame(0), 0.0).scales(viscosity) | known
+        if not tracks.uniform:  # a memory is of an unfiltered flow: G = 1
+            self.method = solving_method(settings, solver, viscosity, torch.ones_like(solver.grid.shell), self.weight)
 
     @torch.no_grad()
     def at(self, columns: Columns, time: float) -> FrameFlow:
