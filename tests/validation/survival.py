@@ -25,7 +25,7 @@ from mpi4py import MPI
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent / "workflows"), str(HERE.parents[1])]
 
-from test_dns_restart import SPLIT  # noqa: E402
+from test_dns import SPLIT  # noqa: E402
 from test_train import SHORT  # noqa: E402
 
 from eddies.io.checkpoint import CheckpointDirectory  # noqa: E402

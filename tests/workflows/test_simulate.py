@@ -19,7 +19,7 @@ from eddies.scene.scene import BOX_LENGTH, Eulerian, Model
 from eddies.workflows import simulate
 from eddies.workflows.simulate import Course, frame_layout, quartiles
 from tests.workflows.contents import assert_same, numbers_in
-from tests.workflows.small_rollout import OWN_METHOD, prepared, scales_of, with_method, write_model
+from tests.workflows.small_rollout import prepared, scales_of, with_method, write_model
 from tests.workflows.stopping import StopAtStep
 
 pytestmark = pytest.mark.usefixtures("quick_spectra", "quick_solves")
@@ -164,19 +164,6 @@ def test_another_number_of_ranks_goes_on_to_rounding(comm, case_of, name, before
             # Frames and pair arithmetic are in single precision.
             assert np.abs(difference).max() < 1e-4 * np.abs(values).max(), column
     comm.Barrier()
-
-
-@pytest.mark.mpi(1)
-def test_a_method_without_a_state_begins_again(comm, small_products, linked, own):
-    scene, folder = small_products
-    directory = linked(folder)
-    own("own_restarting", OWN_METHOD)
-    scene = with_method(scene, "own_restarting:Swept")
-    with pytest.raises(Stopped, match="after the last finished stage"):
-        simulate.run(scene, comm, directory, StopAtStep(comm, 1))
-    simulate.run(scene, comm, directory)
-    assert product(comm, directory)["rollout/status"] == "complete"
-    assert not (directory / "checkpoints-rollout").exists()
 
 
 @pytest.mark.mpi(3)

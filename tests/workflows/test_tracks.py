@@ -368,27 +368,25 @@ def test_a_volume_has_no_images(comm, tmp_path):
     assert found.frame(0)["velocity"][0, 0] * found.unit == pytest.approx(1.4, rel=1e-3)
 
 
-def uniform_tracks(comm, folder, wind, given, seed=1):
-    """A file with 100 tracks that all move with the same `wind` (3,), with or without their velocities."""
-    if comm.rank == 0:
-        times, start = 0.01 * np.arange(5), np.random.default_rng(seed).random((100, 3))
-        position = start + np.multiply.outer(times, wind)[:, None]
-        velocity = np.broadcast_to(wind, position.shape).reshape(-1, 3) if given else None
-        write_tracks(folder / "uniform.h5", np.repeat(times, 100), np.tile(np.arange(100), 5),
-                     position.reshape(-1, 3) % 1, velocity, edge=1.0)
-    comm.Barrier()
-
-
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("wind, given, method", [
     ((1.0, 0.5, -0.2), False, "memory"), ((0.0, 0.0, 0.0), True, "least-squares")])
 def test_tracks_that_move_alike_have_a_uniform_field_and_no_relative_error(comm, tmp_path, no_figures, caplog, wind,
                                                                            given, method):
-    uniform_tracks(comm, tmp_path, wind, given)
-    scene = scene_of(comm, tmp_path, f"""[tracks]
-path = "uniform.h5"
-viscosity = 1e-3
-[reconstruction]
+    """A model could learn nothing from them."""
+    if comm.rank == 0:
+        times, start = 0.01 * np.arange(5), np.random.default_rng(1).random((100, 3))
+        position = start + np.multiply.outer(times, wind)[:, None]
+        velocity = np.broadcast_to(wind, position.shape).reshape(-1, 3) if given else None
+        write_tracks(tmp_path / "uniform.h5", np.repeat(times, 100), np.tile(np.arange(100), 5),
+                     position.reshape(-1, 3) % 1, velocity, edge=1.0)
+    comm.Barrier()
+    section = '[tracks]\npath = "uniform.h5"\nviscosity = 1e-3\n'
+    with pytest.raises(SceneError, match="uniform.h5: all tracks move alike"):
+        tracks.with_tracks(scene_of(comm, tmp_path, section + '[model]\npreset = "resolved"\n[training]\nframes = 2\n'
+                                    "batch = 10\nsteps = 1\n"), comm)
+    comm.Barrier()
+    scene = scene_of(comm, tmp_path, f"""{section}[reconstruction]
 method = "{method}"
 fields = ["velocity", "gradient"]
 """)
@@ -421,15 +419,6 @@ def test_a_noise_that_does_not_fit_gives_a_warning(comm, tmp_path, caplog, facto
                  (position + noise * draw.standard_normal(position.shape)).reshape(-1, 3), edge=1.0)
     read_measured(scene_of(comm, tmp_path, f'[tracks]\npath = "a.h5"\nnoise = {factor * noise}\n').tracks)
     assert [words in line for line in caplog.messages if "noise = " in line] == ([True] if words else [])
-
-
-@pytest.mark.mpi(1)
-def test_tracks_that_move_alike_teach_a_model_nothing(comm, tmp_path):
-    uniform_tracks(comm, tmp_path, (1.0, 0.5, -0.2), True)
-    scene = scene_of(comm, tmp_path, '[tracks]\npath = "uniform.h5"\nviscosity = 1e-3\n[model]\npreset = "resolved"\n'
-                                     '[training]\nframes = 2\nbatch = 10\nsteps = 1\n')
-    with pytest.raises(SceneError, match="uniform.h5: all tracks move alike"):
-        tracks.with_tracks(scene, comm)
 
 
 @pytest.mark.mpi(1, 2)

@@ -158,11 +158,7 @@ def test_checkpoints_that_would_be_lost_are_named_with_step_time_and_reason(comm
     assert not find_work(scene.stages, scene, tmp_path).lost  # there is one to go on from
     (tmp_path / "checkpoints-train/step-00000003.h5").write_text("damaged")
     assert find_work(scene.stages, scene, tmp_path).actions["train"].drops
-
-
-@pytest.mark.mpi(1)
-def test_checkpoints_left_beside_a_model_are_removed(comm, tmp_path, scene):
-    """Those of a direct simulation stay, because a longer run continues from them."""
+    # Those beside a complete model are removed; those of a direct simulation stay, because a longer run continues.
     leave(comm, tmp_path, scene, ["train"])
     save(comm, tmp_path, scene, "train", 7)
     action = find_work(["train"], scene, tmp_path).actions["train"]
