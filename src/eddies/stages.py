@@ -29,7 +29,6 @@ from eddies.parallel.reduction import any_rank
 from eddies.parallel.stop import Stopped, StopRequest
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene, SceneError
-from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.learned.source import ModelDefinition, read_source
 from eddies.workflows.problems import check_ground_truth, directory_problems, memory_of_node, problems
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
@@ -185,10 +184,7 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
                 keep_form(comm, directory / stage.file, scene.kernel.form, stage_provenance(scene, name))
             continue
         if scene.tracers is not None and "dns" in stage.depends_on and not checked:
-            later = step.stages[number:]
-            check = partial(check_frames, later, scene.tracers, scene.own_training, scene.simulation,
-                            scene.seen_in(directory))
-            check_ground_truth(directory / STAGES["dns"].file, later, scene.simulation, check, comm)
+            check_ground_truth(directory / STAGES["dns"].file, step.stages[number:], scene, comm)
             checked = True
         run_stage(name, (scene, comm, directory, stop), comm, directory, stop, action.start == "continue")
 

@@ -128,8 +128,7 @@ def _infeasible(step: Step, comm: Comm, made: Collection[Path], measured: Measur
     decays = scene.spin_up is not None and scene.forcing is None
     if tracers is not None and scales is not None and scales["reynolds_lambda"] >= TURBULENT and (
             not decays and truth in made):
-        yield from _too_few_frames(tracers, turnover_time, partial(
-            check_frames, stages, tracers, scene.own_training, scene.simulation, scene.seen_in(directory)))
+        yield from _too_few_frames(scene, stages, turnover_time, scene.seen_in(directory))
     limits = most_ranks(scene.ground_truth_alone if set(stages) == {"dns"} else scene, measured)
     yield from rank_problems(limits, comm.size)
     if "train" in stages and scene.model.path is None and scene.training.truths is not None:
@@ -187,12 +186,13 @@ def _too_many(key: str, value: float | str, step: float, span: float) -> Iterato
                f"of {MOST_STEPS:.0e}; raise this key, or lower the turnovers or the duration of the run")
 
 
-def _too_few_frames(tracers: Tracers, turnover_time: float, check: Callable[[int], None]) -> Iterator[str]:
-    """Yield a problem if `check` finds too few frames even at the longest possible turnover time."""
+def _too_few_frames(scene: Scene, stages: Sequence[str], turnover_time: float, seen: float) -> Iterator[str]:
+    """Yield a problem if there are too few frames even at the longest possible turnover time."""
+    tracers = scene.tracers
     frames = max(math.ceil(LARGEST_TURNOVER_RATIO * tracers.turnovers * turnover_time / tracers.frame_interval), 1) + 1
     if frames <= MOST_STEPS:
         try:
-            check(frames)
+            check_frames(stages, scene, seen, frames)
         except SceneError as error:
             yield f"[tracers] turnovers = {tracers.turnovers:g} is expected to give at most {frames} frames: {error}"
 
@@ -430,16 +430,15 @@ def check_span(time: Time, now: float, span: float, bound: float, tracers: Trace
         raise SceneError(problem)
 
 
-def check_ground_truth(path: Path, stages: Sequence[str], simulation: Simulation | None,
-                       check: Callable[[int], None], comm: Comm) -> None:
-    """Raise SceneError if a ground truth cannot be used by `stages`; all ranks call it.
+def check_ground_truth(path: Path, stages: Sequence[str], scene: Scene, comm: Comm) -> None:
+    """Raise SceneError if a ground truth cannot be used by `stages` of a scene; all ranks call it.
 
-    The reasons are too few frames, found by `check`; a scale that is 0; and too many steps of the rollout.
+    The reasons are too few frames; a scale that is 0; and too many steps of the rollout.
     """
     with open_product(comm, path, "ground_truth") as file:
         if "particles" not in file:  # measured tracks of which none is in all frames; only fields are made from them
             return
-        check(len(Trajectory(file, "tracers").times))
+        check_frames(stages, scene, scene.seen_in(path.parent), len(Trajectory(file, "tracers").times))
         if {"train", "simulate"} & {*stages}:
             from eddies.workflows.ground_truth.truth import GroundTruth  # imports torch
             truth = GroundTruth(file, comm)
@@ -448,5 +447,5 @@ def check_ground_truth(path: Path, stages: Sequence[str], simulation: Simulation
             except ScaleError as error:
                 raise SceneError(f"{path}: {error}") from None
             turnover_time = truth.reference["eddy_turnover_time"]
-            for problem in _too_many_rollout_steps(simulation, turnover_time) if "simulate" in stages else ():
+            for problem in _too_many_rollout_steps(scene.simulation, turnover_time) if "simulate" in stages else ():
                 raise SceneError(f"{path}: {problem}")
