@@ -9,34 +9,15 @@ from mpi4py import MPI
 from eddies.io.weights import load_weights
 from eddies.report.rollout import moved_by
 from eddies.scene.scene import SceneError, load_scene
-from eddies.workflows import dns, train
+from eddies.workflows import train
 from eddies.workflows import simulate as stage
 from eddies.workflows.rollout.measured import open_rollout
-from tests.workflows.small_rollout import write_kernel
+from tests.workflows.small_rollout import prepared
 
 pytestmark = pytest.mark.usefixtures("quick_spectra")
 
-SCENE = """
-[flow]
-fluid = "compressible"
-cells = 16
-viscosity = 0.05
-sound_speed = 15.0
-[tracers]
-particles_per_side = 8
-turnovers = 0.3
-frame_interval = 0.02
-field_every = 1
-[kernel]
-neighbors = 30
-steps = 1
-[simulation]
-method = "none"
-step = 0.02
-turnovers = 0.2
-frame_interval = 0.04
-start = 0
-"""
+SCENE = ["flow.cells=16", "flow.viscosity=0.05", "kernel.neighbors=30", "simulation.method=none",
+         "simulation.turnovers=0.2"]
 COARSE = ["simulation.method=eulerian", "eulerian.cells=12"]
 SMOOTHED = ['model.terms=["continuity", "wcsph"]', "training.steps=0", "training.frames=2", "training.batch=60",
             "simulation.method=learned", "simulation.step=0.004", "simulation.precision=float64"]
@@ -46,12 +27,10 @@ SMOOTHED = ['model.terms=["continuity", "wcsph"]', "training.steps=0", "training
 def made(comm, shared_folder):
     """A folder with the scene, its ground truth and an untrained kernel."""
     folder = shared_folder()
+    scene = prepared(comm, folder, model="", start=0, turnovers=0.3, side=8, overrides=SCENE,
+                     removals=["training", "tracers.field_cells"])
     if comm.rank == 0:
-        (folder / "baseline.toml").write_text(SCENE)
-    comm.Barrier()
-    scene = load_scene(folder / "baseline.toml")
-    dns.run(scene, comm, folder)
-    write_kernel(comm, folder, scene)
+        (folder / "baseline.toml").write_text(scene.to_toml())
     comm.Barrier()
     return folder
 

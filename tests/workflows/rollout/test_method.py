@@ -21,8 +21,7 @@ from eddies.scene.scene import BOX_LENGTH, Model, SceneError, load_scene
 from eddies.scene.sections import METHODS
 from eddies.workflows import report, simulate, train
 from eddies.workflows.ground_truth.truth import open_truth
-from eddies.workflows.rollout.method import make_method
-from eddies.workflows.rollout.particle_run import SOLVES, ParticleRun
+from eddies.workflows.rollout.method import SOLVES, ParticleRun, make_method
 from tests.workflows.small_rollout import OWN_METHOD, prepared, scales_of, scene_text, with_method
 from tests.workflows.stopping import StopAtStep
 
