@@ -350,7 +350,7 @@ def test_a_volume_has_no_images(comm, tmp_path):
     write_tracks(tmp_path / "a.h5", [0, 1, 2], [0, 0, 0], [[0.1, 0.5, 0.5], [0.8, 0.5, 0.5], [0.1, 0.5, 0.5]])
     found = read_measured(scene_of(comm, tmp_path, '[tracks]\npath = "a.h5"\nvolume = [0, 1, 0, 1, 0, 1]\n'
                                                    'margin = 0.1\n').tracks)
-    assert found.frame(0)["velocity"][0, 0] * found.unit == pytest.approx(1.4, rel=1e-3)
+    assert found.frame(0)["velocity"][0, 0] * found.about["length_unit"] == pytest.approx(1.4, rel=1e-3)
 
 
 @pytest.mark.mpi(1, 2)

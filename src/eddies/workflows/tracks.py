@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,7 @@ from eddies.particles.flow_units import measured_scales
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.pipeline import STAGES
-from eddies.scene.scene import BOX_LENGTH, Flow, Model, Scene, SceneError, Simulation, Tracers
+from eddies.scene.scene import BOX_LENGTH, Flow, Scene, SceneError, Tracers
 from eddies.scene.sections import Eulerian, Initial, Reconstruction, Tracks
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.workflows.ground_truth.flow_run import write_spectra
@@ -65,8 +65,7 @@ def with_tracks(scene: Scene, comm: Comm) -> Scene:
         if each.realisations is not None:
             raise SceneError(f"realisations = {[*each.realisations]}: the file has one realisation; remove the key, "
                              "and write a scene for each file")
-        uses = [f"[{section}]" for section in ("kernel", "model", "simulation") if getattr(each, section) is not None]
-        for problem in _unfit(settings, uses, each.reconstruction, each.model, each.simulation, each.eulerian):
+        for problem in _unfit(each):
             raise SceneError(problem)
     learned = any(part is not None for part in (scene.kernel, scene.model, scene.simulation))
     found = in_files(comm, settings.file, lambda: _sections_of(settings, learned))
@@ -77,10 +76,10 @@ def with_tracks(scene: Scene, comm: Comm) -> Scene:
     return replace(scene, **found, variant={name: replace(each, **found) for name, each in scene.variant.items()})
 
 
-def _unfit(settings: Tracks, learned: Sequence[str], wanted: Reconstruction | None, model: Model | None,
-           simulation: Simulation | None, eulerian: Eulerian | None) -> Iterator[str]:
-    """Yield a message for each setting that cannot be used with tracks. `learned` names those sections among [kernel],
-    [model] and [simulation] that the scene has."""
+def _unfit(scene: Scene) -> Iterator[str]:
+    """Yield a message for each setting of a scene that cannot be used with tracks."""
+    settings, wanted, model, simulation = scene.tracks, scene.reconstruction, scene.model, scene.simulation
+    learned = [f"[{section}]" for section in ("kernel", "model", "simulation") if getattr(scene, section) is not None]
     if wanted is not None:
         if settings.viscosity is None and (wanted.method == "memory" or "acceleration" in wanted.fields):
             yield ("[tracks] viscosity: this key is missing, and the method memory and the acceleration need it; give "
@@ -101,7 +100,7 @@ def _unfit(settings: Tracks, learned: Sequence[str], wanted: Reconstruction | No
     if simulation is not None and simulation.on_grid:
         if settings.viscosity is None:
             yield '[tracks] viscosity: this key is missing, and [simulation] method = "eulerian" needs it; give it'
-        if (eulerian or Eulerian()).start != "particles":
+        if (scene.eulerian or Eulerian()).start != "particles":
             yield ('[eulerian] start = "flow": measured tracks do not give the unfiltered flow; set start = '
                    '"particles"')
 
@@ -119,14 +118,14 @@ def _sections_of(settings: Tracks, learned: bool) -> dict[str, Flow | Tracers]:
     count = present if learned else max(count_for(tracks.spacing), LEAST_TRACKS)
     speed = float(np.sqrt(np.mean(fluctuations(tracks.columns["velocity"])**2)))
     turnover = INTEGRAL_SCALE * BOX_LENGTH / speed if speed > 0 else math.inf
-    width = None if settings.filter_width is None else settings.filter_width / tracks.unit
+    width = None if settings.filter_width is None else settings.filter_width / tracks.about["length_unit"]
     tracers = Tracers(count=count, filtered=settings.filtered or learned, frame_interval=float(tracks.times[1]),
                       filter_width=width, turnovers=max(float(tracks.times[-1] / turnover), 1e-6),
                       field_every=settings.field_every)
-    viscosity = 0.0 if settings.viscosity is None else settings.viscosity / tracks.unit**2
+    viscosity = 0.0 if settings.viscosity is None else settings.viscosity / tracks.about["length_unit"]**2
     cells, sound = max(tracers.cells, tracers.planes, LEAST_CELLS), settings.sound_speed
     flow = Flow(fluid="incompressible", cells=cells, viscosity=viscosity) if sound is None else Flow(
-        fluid="compressible", cells=cells, viscosity=viscosity, sound_speed=sound / tracks.unit)
+        fluid="compressible", cells=cells, viscosity=viscosity, sound_speed=sound / tracks.about["length_unit"])
     return {"flow": flow, "tracers": tracers}
 
 
