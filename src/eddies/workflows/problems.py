@@ -72,12 +72,7 @@ def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = 
         own, stages = step.scene, step.stages
         refused |= dict.fromkeys(f"{own.name}: {problem}" for problem in _infeasible(step, comm, made, measured))
         refused |= dict.fromkeys(directory_problems(stages, comm, step.directory))
-        weights = own.model.weights_file if "train" in stages else None
-        given = weights is not None and weights not in made and on_first_rank(comm, weights.is_file)
-        refused |= dict.fromkeys(_unfit_files(
-            own.initial if "dns" in stages and own.tracks is None else None,
-            ModelDefinition.of(own) if given else None, own.name,
-            own.device if {"train", "simulate"} & {*stages} else "cpu", comm))
+        refused |= dict.fromkeys(_unfit_files(step, comm, made))
         within = on_first_rank(comm, partial(_start_within_training, step, learned))
         for doubt in (*_warnings(step, made, measured), *within):
             doubts.setdefault(doubt, []).append(step.variant or "")
@@ -218,25 +213,22 @@ def directory_problems(stages: Sequence[str], comm: Comm, directory: Path) -> li
         return [f"{directory}: cannot be used ({error.strerror}); choose another --output"]
 
 
-def _unfit_files(initial: Initial | None, definition: ModelDefinition | None, name: str, device: str,
-                 comm: Comm) -> Iterator[str]:
-    """Yield a problem if the file of the initial flow or that of trained weights cannot be used, or if `device` does
-    not exist.
-
-    `initial` is None if no flow is started, and `definition` is None if no weights are read. `name` is the name of the
-    scene.
-    """
+def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
+    """Yield a problem if a step needs the file of an initial flow or of trained weights that cannot be used, or a
+    device that does not exist. Weights in `made`, the files that the planned steps write, are not read."""
+    scene, stages = step.scene, step.stages
+    initial, weights = scene.initial, scene.model.weights_file if "train" in stages else None
     try:
-        if initial is not None and initial.flow.from_file:
+        if "dns" in stages and scene.tracks is None and initial.flow.from_file:
             with stored_states(initial, comm):
                 pass
-        if initial is not None and initial.kind == "spectrum":
+        if "dns" in stages and scene.tracks is None and initial.kind == "spectrum":
             given_spectrum(initial, comm)
-        if definition is not None:
-            read_source(name, definition, comm)
-        if device != "cpu":
+        if weights is not None and weights not in made and on_first_rank(comm, weights.is_file):
+            read_source(scene.name, ModelDefinition.of(scene), comm)
+        if scene.device != "cpu" and {"train", "simulate"} & {*stages}:
             from eddies.particles.devices import prepare_torch  # imports torch
-            prepare_torch(device, comm)
+            prepare_torch(scene.device, comm)
     except UserError as error:
         yield str(error)
 
