@@ -146,20 +146,15 @@ def released(flow: FlowRun, scene: Scene, product: Path, saved: Checkpoint | Non
 
 def write_set(path: Path, own: Scene, tracers: TracerRun, name: str) -> None:
     """Write the ground truth of the set of tracers `name`, whose scene is `own`; collective. A file with the same
-    settings is kept, so that products made from it stay valid."""
+    settings is kept, so that products made from it stay valid. So is a scene.toml beside it."""
     comm, flow = tracers.flow.guard.checkpoints.comm, tracers.flow
     if in_files(comm, path, partial(product_fingerprint, path)) == stage_fingerprint(own, "dns"):
         return
-    in_files(comm, path, partial(prepare_set, path.parent, own.to_toml()))
+    scene = path.parent / "scene.toml"
+    in_files(comm, path, lambda: scene.exists() or write_files({scene: own.to_toml()}))
     with create_product(comm, path, "ground_truth", stage_provenance(own, "dns")) as part:
         write_tracers(part, tracers, name, own.forcing)
         write_flow(part, flow, scales_of(tracers.released) | tracers.scales(name), own.spin_up)
-
-
-def prepare_set(directory: Path, text: str) -> None:
-    """Write the scene of a set of tracers to scene.toml in its directory, unless this file exists."""
-    if not (directory / "scene.toml").exists():
-        write_files({directory / "scene.toml": text})
 
 
 def write_tracers(file: File, tracers: TracerRun, name: str, forcing: Forcing | None) -> None:
