@@ -29,6 +29,14 @@ def refused(comm, capfd, command, *messages, code=2):
         assert all(message in errors for message in messages), errors
 
 
+def first_rank(comm, action, *arguments, **options):
+    """Call an action on rank 0, after all ranks have done their work before it and before they go on."""
+    comm.Barrier()
+    if comm.rank == 0:
+        action(*arguments, **options)
+    comm.Barrier()
+
+
 def set_all(changes):
     """The options that set these keys on the command line."""
     return [word for change in changes for word in ("--set", change)]

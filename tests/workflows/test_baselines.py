@@ -12,6 +12,7 @@ from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import train
 from eddies.workflows import simulate as stage
 from eddies.workflows.rollout.measured import open_rollout
+from tests.commands import first_rank
 from tests.workflows.small_rollout import prepared
 
 pytestmark = pytest.mark.usefixtures("quick_spectra")
@@ -29,9 +30,7 @@ def made(comm, shared_folder):
     folder = shared_folder()
     scene = prepared(comm, folder, model="", start=0, turnovers=0.3, side=8, overrides=SCENE,
                      removals=["training", "tracers.field_cells"])
-    if comm.rank == 0:
-        (folder / "baseline.toml").write_text(scene.to_toml())
-    comm.Barrier()
+    first_rank(comm, (folder / "baseline.toml").write_text, scene.to_toml())
     return folder
 
 

@@ -20,6 +20,7 @@ from eddies.scene.sections import SpinUp
 from eddies.workflows import dns
 from eddies.workflows.ground_truth.scene_flow import build_fluid, initial_state
 from eddies.workflows.ground_truth.truth import GroundTruth
+from tests.commands import first_rank
 from tests.full_disk import largest_file
 from tests.small_scene import TINY
 from tests.workflows.contents import assert_same, numbers_in
@@ -361,10 +362,7 @@ def test_a_finished_run_goes_on_for_longer(comm, tmp_path, whole, caplog):
     assert_same(found, expected)
     with pytest.raises(SceneError, match="turnovers = 0.09: the checkpoint in"):
         dns.run(short, comm, run)
-    comm.Barrier()
-    if comm.rank == 0:
-        (run / "ground_truth.h5").unlink()
-    comm.Barrier()
+    first_rank(comm, (run / "ground_truth.h5").unlink)
     dns.run(short, comm, run)  # without its frames the checkpoint is worth nothing
     assert comm.rank > 0 or "lacks the frames before the checkpoint" in caplog.text
     assert len(product(comm, run)[FRAMES]) < len(expected[FRAMES])

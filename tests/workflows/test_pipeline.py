@@ -20,7 +20,7 @@ from eddies.stored_run import open_run
 from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.learned.training_data import training_data
-from tests.commands import run_cli
+from tests.commands import first_rank, run_cli
 from tests.left_out import leave_out_figures
 from tests.small_scene import TINY
 
@@ -174,9 +174,7 @@ def test_a_trained_model_runs_on_another_flow(comm, run_directory, tmp_path):
     """At twice the Mach number, with the scales of that flow only."""
     slower = load_scene(TINY, ["flow.sound_speed=11", "seed=2", "spin_up.turnovers=0.5", "tracers.turnovers=0.25",
                                "kernel.steps=4", "simulation.turnovers=0.1", f"model.path={run_directory}"])
-    if comm.rank == 0:
-        (tmp_path / "slower.toml").write_text(dataclasses.replace(slower, training=None).to_toml())
-    comm.Barrier()
+    first_rank(comm, (tmp_path / "slower.toml").write_text, dataclasses.replace(slower, training=None).to_toml())
     assert run_cli("run", tmp_path / "slower.toml", "--output", tmp_path / "run") == 0
     comm.Barrier()
     with h5py.File(run_directory / "model.h5") as trained, h5py.File(tmp_path / "run" / "model.h5") as adopted:

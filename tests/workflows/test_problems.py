@@ -16,6 +16,7 @@ from eddies.workflows.problems import check_ground_truth, memory_of_node, proble
 from eddies.workflows.estimates import storage
 from eddies.workflows.tracks import with_tracks
 from eddies.workflows.variants import steps
+from tests.commands import first_rank
 from tests.bad_scenes import INFEASIBLE
 from tests.changed_product import changed
 from tests.small_scene import TINY, one_model, problems_of, scene_file
@@ -268,9 +269,7 @@ def test_files_that_do_not_fit(comm, tmp_path):
     start = ["initial.kind=file", f"initial.path={path}/start.h5", "realisations=[7]"]
     own, other = problems_of(load_scene(TINY, start, ["initial.peak_wavenumber"]), comm)[0]
     assert f"{path}/start.h5" in own and f"{path}/realisation-7/start.h5" in other
-    if comm.rank == 0:
-        (tmp_path / "model.h5").write_text("nothing")
-    comm.Barrier()
+    first_rank(comm, (tmp_path / "model.h5").write_text, "nothing")
     (line,), _ = problems_of(load_scene("hit-mt008", [f"model.path={path}"], ["variant"]), comm)
     assert f"{path}/model.h5" in line
 

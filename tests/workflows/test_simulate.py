@@ -18,6 +18,7 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.scene.scene import BOX_LENGTH, Eulerian, Model
 from eddies.workflows import simulate
 from eddies.workflows.simulate import Course, frame_layout, quartiles
+from tests.commands import first_rank
 from tests.workflows.contents import assert_same, numbers_in
 from tests.workflows.small_rollout import prepared, scales_of, with_method, write_model
 from tests.workflows.stopping import StopAtStep
@@ -86,9 +87,7 @@ def check_splits(comm, scene, directory, monkeypatch, each=1):
     whole, saved, checkpoints = product(comm, directory), directory / "saved", directory / "checkpoints-rollout"
     steps, at_frames = int(whole["rollout/steps"]), sorted(set(whole["particles/model/position/step"].tolist()))
     assert whole["rollout/status"] == "complete" and len(at_frames) >= 2
-    if comm.rank == 0:
-        checkpoints.rename(saved)
-    comm.Barrier()
+    first_rank(comm, checkpoints.rename, saved)
     found = sorted(saved.glob("step-*"))
     assert len(found) == steps >= 3
     for split in sorted({0, 1, at_frames[1], steps - 1} - {steps})[each - 1::each]:
@@ -126,9 +125,7 @@ def test_a_stopped_rollout_continues_and_leaves_nothing_else(comm, small_product
     names = {path.name for path in directory.iterdir()}
     simulate.run(scene, comm, directory)
     whole = product(comm, directory)
-    if comm.rank == 0:
-        (directory / "rollout.h5").unlink()
-    comm.Barrier()
+    first_rank(comm, (directory / "rollout.h5").unlink)
     for number in (1, 2):
         with pytest.raises(Stopped, match=f"from step {number} of the rollout"):
             simulate.run(scene, comm, directory, StopAtStep(comm, 1))

@@ -12,6 +12,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import export, tracks
 from eddies.workflows.ground_truth.track_frames import read_measured
+from tests.commands import first_rank
 from tests.workflows.small_rollout import prepared
 
 MILLIMETRES, MILLISECONDS = 20.0, 4.0  # edge of the box, and the time unit of the file in that of the flow
@@ -46,9 +47,7 @@ def twin(comm, shared_folder):
 
 
 def scene_of(comm, folder, text, name="mine.toml"):
-    if comm.rank == 0:
-        (folder / name).write_text(text)
-    comm.Barrier()
+    first_rank(comm, (folder / name).write_text, text)
     return load_scene(folder / name)
 
 

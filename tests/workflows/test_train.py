@@ -23,6 +23,7 @@ from eddies.workflows import dns, train, train_kernel
 from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.run_directory.work import stage_seconds
 from eddies.workflows.train import _given_rate_error
+from tests.commands import first_rank
 from tests.small_scene import TINY
 from tests.workflows.contents import assert_same, numbers_in
 from tests.workflows.stopping import StopAtStep
@@ -111,10 +112,7 @@ def test_a_training_is_not_lost_to_a_picture(comm, products, linked, monkeypatch
         assert len(warnings) == (comm.rank == 0), fault
         comm.Barrier()
         assert (directory / "model.h5").exists()
-        comm.Barrier()
-        if comm.rank == 0:
-            (directory / "model.h5").unlink()
-        comm.Barrier()
+        first_rank(comm, (directory / "model.h5").unlink)
 
 
 @pytest.mark.mpi(2)
@@ -139,10 +137,7 @@ def test_a_training_continues_with_inputs_of_the_same_settings(comm, products, l
     for _ in range(2):
         stages.run_stages(["train"], scene, comm, directory, StopRequest(comm))
         assert not leftover.exists()
-        comm.Barrier()
-        if comm.rank == 0:
-            leftover.mkdir()
-        comm.Barrier()
+        first_rank(comm, leftover.mkdir)
 
 
 SMALL = ["flow.cells=16", "flow.viscosity=0.1", "spin_up.turnovers=0.05", "tracers.turnovers=0.9",
@@ -214,9 +209,7 @@ def test_training_evaluates_pairs_with_ghosts_and_sums_gradients(comm, tmp_path,
 
 @pytest.mark.mpi(2)
 def test_a_density_equal_to_the_true_one_changes_at_the_true_rate(comm, tmp_path):
-    if comm.rank == 0:
-        write_ground_truth(MPI.COMM_SELF, tmp_path, frames=5)
-    comm.Barrier()
+    first_rank(comm, write_ground_truth, MPI.COMM_SELF, tmp_path, frames=5)
     exact = SimpleNamespace(model=SimpleNamespace(integrates_density=True),
                             rates=lambda particles: SimpleNamespace(density=particles.density))
     with open_truth(comm, tmp_path / "ground_truth.h5") as truth:

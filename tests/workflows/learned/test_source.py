@@ -19,6 +19,7 @@ from eddies.workflows.learned.model import trained_model
 from eddies.workflows.learned.source import (ModelDefinition, read_source, seen_by, seen_flows, start_within_training,
                                              trained_on)
 from eddies.workflows.run_directory.fingerprints import flow_fingerprint
+from tests.commands import first_rank
 from tests.changed_product import changed
 from tests.small_scene import TINY, one_model
 from tests.workflows.synthetic_run import write_ground_truth
@@ -108,9 +109,7 @@ def test_missing_weights_are_refused_before_any_work_on_all_ranks(comm, tmp_path
 @pytest.mark.mpi(1, 2)
 def test_a_file_never_has_a_class_imported(comm, tmp_path, own):
     """The scene must name the class again, and one error says so."""
-    if comm.rank == 0:
-        own("own_source", OWN_TERM)
-    comm.Barrier()
+    first_rank(comm, own, "own_source", OWN_TERM)
     terms = {"pressure": {"force": True}, "own_source:Drag": {}}
     write_source(comm, tmp_path, {"terms": terms, "scales": SCALES.to_dict(), "neighbors": 56.0})
     with pytest.raises(SceneError, match=r'terms = \["pressure"\], .* \["pressure", "own_source:Drag"\]'):

@@ -23,6 +23,7 @@ from eddies.workflows.learned.training_data import load_frame, model_for, open_t
 from eddies.workflows.problems import problems, rank_problems
 from eddies.workflows.rollout.method import forcing_of, make_method
 from eddies.workflows.variants import steps
+from tests.commands import first_rank
 from tests.changed_product import changed
 from tests.workflows.small_rollout import with_method
 
@@ -70,9 +71,7 @@ def scene_of(directory, *overrides):
 
 def made(comm, directory, *overrides, runs=("own",)):
     """A scene, and ground truths in run directories below `directory`, each with its own seed."""
-    if comm.rank == 0:
-        (directory / "own.toml").write_text(SCENE)
-    comm.Barrier()
+    first_rank(comm, (directory / "own.toml").write_text, SCENE)
     for seed, name in enumerate(runs, 1):
         (directory / name).mkdir(exist_ok=True)
         dns.run(scene_of(directory, *overrides, f"seed={seed}"), comm, directory / name)

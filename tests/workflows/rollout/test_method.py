@@ -22,6 +22,7 @@ from eddies.scene.sections import METHODS
 from eddies.workflows import report, simulate, train
 from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.rollout.method import SOLVES, ParticleRun, make_method
+from tests.commands import first_rank
 from tests.workflows.small_rollout import OWN_METHOD, prepared, scales_of, scene_text, with_method
 from tests.workflows.stopping import StopAtStep
 
@@ -215,9 +216,7 @@ def test_terms_that_read_the_density_are_refused_in_an_incompressible_flow(tmp_p
 def test_a_method_of_the_users(comm, small_products, linked, own):
     """It has no state, so a stopped rollout begins again."""
     directory = linked(small_products[1])
-    if comm.rank == 0:
-        own("own_method", OWN_METHOD)
-    comm.Barrier()
+    first_rank(comm, own, "own_method", OWN_METHOD)
     scene = with_method(replace(small_products[0], model=Model(preset="resolved")), "own_method:Swept")
     with pytest.raises(Stopped, match="after the last finished stage"):
         simulate.run(scene, comm, directory, StopAtStep(comm, 1))
