@@ -26,8 +26,8 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import (BOX_LENGTH, Flow, Forcing, Initial, Model, Reconstruction, Scene, SceneError,
                                 Simulation, Time, Tracers, Tracks, Training)
 from eddies.scene.terms import StepUnits
-from eddies.workflows.estimates import (Estimates, Measured, Storage, estimate, in_units, most_disk,
-                                        most_ranks, storage)
+from eddies.workflows.estimates import (Estimates, Measured, Storage, estimate, in_units, most_disk, most_ranks,
+                                        storage)
 from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.ground_truth.scene_flow import given_spectrum, stored_states
 from eddies.workflows.learned.source import ModelDefinition, read_source, seen_by, seen_flows, start_within_training

@@ -16,8 +16,8 @@ from eddies.io.run_lock import job_in
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import MAKER_OF, STAGES, Stage
 from eddies.scene.scene import Scene, SceneError, load_scene
-from eddies.workflows.run_directory.fingerprints import set_files, stage_fingerprint
 from eddies.workflows.estimates import in_units
+from eddies.workflows.run_directory.fingerprints import set_files, stage_fingerprint
 from eddies.workflows.run_directory.work import differences, of_other_settings, stage_seconds
 from eddies.workflows.variants import steps
 
