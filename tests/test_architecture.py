@@ -163,7 +163,7 @@ def test_tools_import_nothing_from_the_package_that_needs_others():
     ("workflows/simulate", "from eddies.report import ground_truth", "imports eddies.report.ground_truth"),
     ("io/hdf5", "from mpi4py import MPI\ncomm = MPI.COMM_WORLD", "uses COMM_WORLD"),
     ("io/hdf5", "from mpi4py.MPI import COMM_WORLD", "uses COMM_WORLD"),
-    ("scene/methods", 'METHODS = {"none": "eddies.workflows.rollout.particle_run:ParticleRun"}', "not below it"),
+    ("scene/methods", 'METHODS = {"none": "eddies.workflows.rollout.method:ParticleRun"}', "not below it"),
 ])
 def test_a_breach_is_found(tmp_path, module, source, breach):
     path = tmp_path / f"{module}.py"

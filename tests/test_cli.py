@@ -144,10 +144,10 @@ def test_more_ranks_than_slabs_are_refused_before_any_work(comm, tmp_path, capfd
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("before, kept", [('{"dns": 1.5}', {"dns", "train"}), ('{"dns": 1', {"train"})])
 def test_seconds_of_stages_are_kept(comm, tmp_path, before, kept):
-    from eddies.stages import add_seconds
+    from eddies.stages import record_seconds
     (tmp_path / "stage_seconds.json").write_text(before)
-    assert add_seconds("train", 2.0, comm, tmp_path) == 2
-    assert add_seconds("train", 3.0, comm, tmp_path) == 5
+    assert record_seconds("train", 2.0, comm, tmp_path) == 2
+    assert record_seconds("train", 3.0, comm, tmp_path) == 5
     assert json.loads((tmp_path / "stage_seconds.json").read_text()).keys() == kept
     assert len(list(tmp_path.iterdir())) == 1
 
@@ -155,9 +155,9 @@ def test_seconds_of_stages_are_kept(comm, tmp_path, before, kept):
 @pytest.mark.mpi(2, timeout=30)
 def test_seconds_that_cannot_be_written_are_an_error_on_all_ranks(comm, tmp_path):
     from eddies.io.hdf5 import ProductError
-    from eddies.stages import add_seconds
+    from eddies.stages import record_seconds
     with pytest.raises(ProductError, match="nowhere/stage_seconds.json.*: No such file or directory"):
-        add_seconds("train", 2.0, comm, tmp_path / "nowhere")
+        record_seconds("train", 2.0, comm, tmp_path / "nowhere")
 
 
 @pytest.mark.mpi(2)

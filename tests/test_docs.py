@@ -21,8 +21,7 @@ from eddies.scene.rules import quoted
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError, Tracers, builtin_scenes, load_scene
 from eddies.scene.sections import METHODS, SET_KEYS, Simulation
 from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS
-from eddies.workflows.estimates import estimate
-from eddies.workflows.resources import most_ranks
+from eddies.workflows.estimates import estimate, most_ranks
 from tests.commands import python
 
 CHECKOUT = Path(__file__).parents[1]

@@ -36,7 +36,6 @@ log = logging.getLogger("eddies")
 BAD_INPUT = 2
 INTERRUPTED = 128 + signal.SIGINT
 STOPPED = 75  # EX_TEMPFAIL; the same command, given again, continues the work
-REPORT = Path("report") / "index.html"
 STOP_SIGNALS = (signal.SIGUSR1, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 STOPPING = b"eddies: stops after this step; a second interrupt ends it at once\n"
 # The examples at the end of the help of each command.
@@ -205,8 +204,7 @@ def run_command(options: argparse.Namespace, comm: Comm) -> None:
                        60 * options.checkpoint_minutes)
     stages = scene.stages_of_all if options.command == "run" else (options.command,)
     run_stages(stages, scene, comm, directory, stop, options.overwrite, getattr(options, "variants", ()))
-    last = STAGES[stages[-1]]
-    made = directory / (last.file if last.product else REPORT)
+    made = directory / STAGES[stages[-1]].file
     log.log(OUTCOME, "%s: %s, after %s: %s", options.command, scene.name, duration(time.perf_counter() - start),
             made if made.exists() else directory)  # each variant may have its own product
 
@@ -216,7 +214,7 @@ def report_command(options: argparse.Namespace, comm: Comm) -> None:
     if not options.run.is_dir():
         raise SceneError(f"{options.run}: no such directory; give a run directory, such as runs/tiny")
     import_module("eddies.workflows.report").run(options.run, comm, options.variants, output=options.output)
-    page = options.run / REPORT if options.output is None else options.output / REPORT.name
+    page = options.run / STAGES["report"].file if options.output is None else options.output / "index.html"
     log.log(OUTCOME, "report: %s", page)
     if options.open and comm.rank == 0:
         import webbrowser

@@ -1,4 +1,7 @@
-"""The stages of a scene: the product of each, and what it depends on."""
+"""The stages of a scene: what each reads and makes, and when a scene asks for it.
+
+The module of a stage in workflows/ has its function `run`.
+"""
 
 from dataclasses import dataclass
 
@@ -11,50 +14,59 @@ class Stage:
     ----------
     name : name of the stage and of its command.
     about : its result in words, for the help of the command.
-    section : the section of a scene that asks for the stage; None if the stage is always run.
-    product : kind of its product, such as "model" for the file model.h5 in the run directory; None without a product.
+    asked_by : properties of a scene; it asks for the stage if none of them is None or false. The first is a section.
+    product : kind of its product, such as "model" for the file model.h5 in the run directory; None for the report.
     reads : sections and properties of a scene on which its product depends, besides those of the stages before it (see
         workflows/run_directory/fingerprints.py).
     depends_on : all stages on which its product depends, if the scene has them.
     checkpoints : directory of its checkpoints in the run directory; None without checkpoints.
     but : keys "section.key", in the sections of `reads`, on which its product does not depend.
+    duration : keys that only set the duration of the stage. If nothing else differs, it continues from a checkpoint.
+    shared : whether variants share the product if their settings agree.
     """
 
     name: str
     about: str
-    section: str | None
+    asked_by: tuple[str, ...]
     product: str | None
     reads: tuple[str, ...]
     depends_on: tuple[str, ...]
     checkpoints: str | None
     but: tuple[str, ...] = ()
+    duration: tuple[str, ...] = ()
+    shared: bool = False
 
     @property
     def file(self) -> str:
-        """File name of the product."""
-        return f"{self.product}.h5"
+        """Path of the product, or of the page of the report, in the run directory."""
+        return "report/index.html" if self.product is None else f"{self.product}.h5"
+
+    @property
+    def folder(self) -> str | None:
+        """The directory that the stage makes in the run directory; None if it makes only a file."""
+        return "report" if self.product is None else self.checkpoints
 
 
 STAGES = {stage.name: stage for stage in (
-    Stage("dns", "ground truth: direct simulation, filter, tracers; or measured tracks", "flow", "ground_truth",
+    Stage("dns", "ground truth: direct simulation, filter, tracers; or measured tracks", (), "ground_truth",
           ("seed", "tracks", "flow", "initial", "start", "forcing", "time", "spin_up", "tracers", "own_flow",
            "own_initial"),
-          (), "checkpoints"),
-    Stage("train-kernel", "the smoothing kernel", "kernel", "kernel", ("kernel", "window"),
-          ("dns",), "checkpoints-kernel", but=("kernel.form",)),
+          (), "checkpoints", duration=("tracers.turnovers", "time.duration"), shared=True),
+    Stage("train-kernel", "the smoothing kernel", ("kernel",), "kernel", ("kernel", "window"),
+          ("dns",), "checkpoints-kernel", but=("kernel.form",), shared=True),
     Stage("reconstruct", "velocity, gradient, pressure and acceleration of each frame, from particle tracks",
-          "reconstruction", "reconstruction", ("reconstruction",), ("dns", "train-kernel"),
-          "checkpoints-reconstruct"),
-    Stage("train", "the model of the particles", "model", "model",
+          ("reconstruction",), "reconstruction", ("reconstruction",), ("dns", "train-kernel"),
+          "checkpoints-reconstruct", shared=True),
+    Stage("train", "the model of the particles", ("model", "uses_model"), "model",
           ("device", "model", "weights", "training", "truths", "own_model"),
           ("dns", "train-kernel"), "checkpoints-train"),
-    Stage("find-step", "the cheapest time step with which the rollout has converged", "simulation", "step",
-          ("device", "simulation", "confirming", "window", "truths", "eulerian", "own_simulation"),
+    Stage("find-step", "the cheapest time step with which the rollout has converged", ("simulation", "finds_step"),
+          "step", ("device", "simulation", "confirming", "window", "truths", "eulerian", "own_simulation"),
           ("dns", "train-kernel", "train"), None, but=("simulation.turnovers", "simulation.start")),
-    Stage("simulate", "the rollout of the trained model, without the direct simulation", "simulation", "rollout",
+    Stage("simulate", "the rollout of the trained model, without the direct simulation", ("simulation",), "rollout",
           ("device", "simulation", "found_step", "window", "truths", "eulerian", "own_simulation"),
           ("dns", "train-kernel", "train", "find-step"), "checkpoints-rollout"),
-    Stage("report", "figures, one page and metrics.json of a run directory", None, None,
+    Stage("report", "figures, one page and metrics.json of a run directory", (), None,
           (), ("dns", "train-kernel", "reconstruct", "train", "find-step", "simulate"), None),
 )}
 #: The stage that makes each kind of product.

@@ -29,7 +29,6 @@ from eddies.parallel.reduction import any_rank
 from eddies.parallel.stop import Stopped, StopRequest
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene, SceneError
-from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.learned.source import ModelDefinition, read_source
 from eddies.workflows.problems import check_ground_truth, directory_problems, memory_of_node, problems
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
@@ -65,25 +64,10 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     if scene.of_tracks:
         from eddies.workflows.tracks import with_tracks  # imports torch
         scene = with_tracks(scene, comm)
-    settings = [scene.to_toml(), *(stage_fingerprint(scene, stage) for stage in scene.stages), str(directory), *stages,
-                *variants]
-    require_same(comm, hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:16],
-                 "a scene, stages and a directory with the SHA-256 {}")
+    require_same_work(scene, stages, directory, variants, comm)
     warn_of_few_processors(comm)
-    scene.check_variants(variants)
-    scene.check_unseen(directory)
-    planned, reported = steps(scene, stages, directory, variants), "report" in stages
-    if not scene.variant or not planned and not reported:
-        for each in [scene.variant[name] for name in variants] or [scene]:
-            each.check_stages(stages)
-    refused, warnings = problems(scene, planned, comm, memory_of_node(comm))
-    for problem in [*refused, *(directory_problems(("report",), comm, directory) if reported else ())]:
-        raise SceneError(problem)
-    made = {file for step in planned for file in step.files}
-    for step in planned:
-        check_inputs(step, comm, made)
-    if on_first_rank(comm, lambda: os.path.exists(directory / "STOP")):  # ends a chain of jobs that resubmit themselves
-        raise SceneError(f"{directory / 'STOP'}: asks the job to stop before it begins; remove the file to continue")
+    planned = plan(scene, stages, directory, variants)
+    warnings = refuse_problems(scene, planned, stages, directory, comm)
     with lock_directory(comm, directory):
         for step in planned:
             in_files(comm, step.directory, partial(
@@ -91,26 +75,71 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
         prepare_directory(scene.to_toml(), comm, directory)
         for warning in warnings if comm.rank == 0 else ():
             log.warning(warning)
-        failures: dict[str, str] = {}
-        for number, step in enumerate(planned, 1):
-            if step.variant in failures:
-                continue
-            if len(planned) > 1:
-                log.info("%s, part %d of %d: %s", step.directory, number, len(planned), ", ".join(step.stages))
-            inner = step.directory != directory  # this directory has a lock of its own
-            with (recording_failure(failures, step.variant, step.directory, comm),
-                  lock_directory(comm, step.directory) if inner else nullcontext()):
-                if inner:
-                    linked = {holder / STAGES[stage].file: stage_fingerprint(step.scene, stage)
-                              for stage, holder in step.links.items()}
-                    in_files(comm, step.directory, partial(link_products, linked, step.directory))
-                    prepare_directory(step.scene.to_toml(), comm, step.directory)
-                run_step(step, comm, stop, overwrite)
-        if reported:
+        failures = run_steps(planned, directory, comm, stop, overwrite)
+        if "report" in stages:
             run_stage("report", (directory, comm, variants, stop), comm, directory, stop, False)
     if failures:
         raise VariantsFailed(f"{scene.name}: variants failed: " + "; ".join(
             f"{name} ({failure})" for name, failure in failures.items()))
+
+
+def require_same_work(scene: Scene, stages: Sequence[str], directory: Path, variants: Sequence[str],
+                      comm: Comm) -> None:
+    """Raise UserError unless all ranks have the same scene, with the same files, and the same stages, directory and
+    variants."""
+    settings = [scene.to_toml(), *(stage_fingerprint(scene, stage) for stage in scene.stages), str(directory), *stages,
+                *variants]
+    require_same(comm, hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:16],
+                 "a scene, stages and a directory with the SHA-256 {}")
+
+
+def plan(scene: Scene, stages: Sequence[str], directory: Path, variants: Sequence[str]) -> list[Step]:
+    """Return the steps of a run. Raise SceneError for an unknown variant, for a stage that a scene does not ask for, or
+    if a model is trained on a realisation."""
+    scene.check_variants(variants)
+    scene.check_unseen(directory)
+    planned = steps(scene, stages, directory, variants)
+    if not scene.variant or not planned and "report" not in stages:
+        for each in [scene.variant[name] for name in variants] or [scene]:
+            each.check_stages(stages)
+    return planned
+
+
+def refuse_problems(scene: Scene, planned: Sequence[Step], stages: Sequence[str], directory: Path,
+                    comm: Comm) -> list[str]:
+    """Raise SceneError for a problem that is known before the run, also for a file STOP. Raise ProductError if an input
+    is missing that no step makes. Return the warnings."""
+    refused, warnings = problems(scene, planned, comm, memory_of_node(comm))
+    for problem in [*refused, *(directory_problems(("report",), comm, directory) if "report" in stages else ())]:
+        raise SceneError(problem)
+    made = {file for step in planned for file in step.files}
+    for step in planned:
+        check_inputs(step, comm, made)
+    if on_first_rank(comm, lambda: os.path.exists(directory / "STOP")):  # ends a chain of jobs that resubmit themselves
+        raise SceneError(f"{directory / 'STOP'}: asks the job to stop before it begins; remove the file to continue")
+    return warnings
+
+
+def run_steps(planned: Sequence[Step], directory: Path, comm: Comm, stop: StopRequest,
+              overwrite: bool) -> dict[str, str]:
+    """Run steps in order and return the errors of variants that failed, by name. The later steps of such a variant are
+    left out. The caller holds the lock of the run directory."""
+    failures: dict[str, str] = {}
+    for number, step in enumerate(planned, 1):
+        if step.variant in failures:
+            continue
+        if len(planned) > 1:
+            log.info("%s, part %d of %d: %s", step.directory, number, len(planned), ", ".join(step.stages))
+        inner = step.directory != directory  # this directory has a lock of its own
+        with (recording_failure(failures, step.variant, step.directory, comm),
+              lock_directory(comm, step.directory) if inner else nullcontext()):
+            if inner:
+                linked = {holder / STAGES[stage].file: stage_fingerprint(step.scene, stage)
+                          for stage, holder in step.links.items()}
+                in_files(comm, step.directory, partial(link_products, linked, step.directory))
+                prepare_directory(step.scene.to_toml(), comm, step.directory)
+            run_step(step, comm, stop, overwrite)
+    return failures
 
 
 @contextmanager
@@ -155,10 +184,7 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
                 keep_form(comm, directory / stage.file, scene.kernel.form, stage_provenance(scene, name))
             continue
         if scene.tracers is not None and "dns" in stage.depends_on and not checked:
-            later = step.stages[number:]
-            check = partial(check_frames, later, scene.tracers, scene.own_training, scene.simulation,
-                            scene.seen_in(directory))
-            check_ground_truth(directory / STAGES["dns"].file, later, scene.simulation, check, comm)
+            check_ground_truth(directory / STAGES["dns"].file, step.stages[number:], scene, comm)
             checked = True
         run_stage(name, (scene, comm, directory, stop), comm, directory, stop, action.start == "continue")
 
@@ -170,19 +196,18 @@ def run_stage(name: str, arguments: Sequence[Any], comm: Comm, directory: Path, 
     earlier runs."""
     log.info("%s: starts on %d %s", name, comm.size, "rank" if comm.size == 1 else "ranks")
     start = time.perf_counter()
-    of_tracks = name == "dns" and arguments[0].tracks is not None
     # The report has run(directory, comm, variants, stop), the other stages have run(scene, comm, directory, stop).
-    run = import_module(f"eddies.workflows.{'tracks' if of_tracks else name.replace('-', '_')}").run
+    run = import_module(f"eddies.workflows.{name.replace('-', '_')}").run
     stop.check()
     if not begun:
-        forget_seconds(name, comm, directory)
+        record_seconds(name, None, comm, directory)
     try:
         run(*arguments)
         comm.Barrier()
     except Stopped:
-        add_seconds(name, time.perf_counter() - start, comm, directory)
+        record_seconds(name, time.perf_counter() - start, comm, directory)
         raise
-    seconds = add_seconds(name, time.perf_counter() - start, comm, directory)
+    seconds = record_seconds(name, time.perf_counter() - start, comm, directory)
     log.info("%s: took %s", name, duration(seconds))
 
 
@@ -220,28 +245,19 @@ def prepare_directory(text: str, comm: Comm, directory: Path) -> None:
     in_files(comm, directory, write)
 
 
-def add_seconds(stage: str, seconds: float, comm: Comm, directory: Path) -> float:
-    """Add `seconds` to the wall time of a stage in stage_seconds.json and return the sum. The sum lacks the time of
-    runs that were killed or failed."""
+def record_seconds(stage: str, seconds: float | None, comm: Comm, directory: Path) -> float:
+    """Add `seconds` to the wall time of a stage in stage_seconds.json and return the sum; None removes the time of a
+    stage that starts from its beginning. The sum lacks the time of runs that were killed or failed."""
     path = directory / SECONDS
 
-    def add() -> float:
+    def record() -> float:
         recorded = stage_seconds(directory)
-        whole = recorded.get(stage, 0.0) + seconds
-        write_files({path: json.dumps({**recorded, stage: round(whole, 3)}, indent=2) + "\n"})
+        whole = recorded.get(stage, 0.0) + (seconds or 0.0)
+        if seconds is not None:
+            recorded[stage] = round(whole, 3)
+        elif recorded.pop(stage, None) is None:
+            return whole
+        write_files({path: json.dumps(recorded, indent=2) + "\n"})
         return whole
 
-    return in_files(comm, path, add)
-
-
-def forget_seconds(stage: str, comm: Comm, directory: Path) -> None:
-    """Remove the wall time of a stage that starts from its beginning."""
-    path = directory / SECONDS
-
-    def forget() -> None:
-        recorded = stage_seconds(directory)
-        if stage in recorded:
-            del recorded[stage]
-            write_files({path: json.dumps(recorded, indent=2) + "\n"})
-
-    in_files(comm, path, forget)
+    return in_files(comm, path, record)

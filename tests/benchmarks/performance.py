@@ -35,9 +35,8 @@ from eddies.particles.flow_units import planes_for, resolved_shells
 from eddies.report.figures import FOURTH, MODEL, SECOND, THIRD, TRUTH, letter, panels, png, styled
 from eddies.scene.scene import BOX_LENGTH, Scene, load_scene
 from eddies.spectral.spectral_grid import SpectralGrid
-from eddies.workflows.estimates import estimate
+from eddies.workflows.estimates import estimate, most_ranks
 from eddies.workflows.learned.source import ModelDefinition
-from eddies.workflows.resources import most_ranks
 from eddies.workflows.variant_rows import processor
 
 HERE = Path(__file__).parent

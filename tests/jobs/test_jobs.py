@@ -82,7 +82,7 @@ def test_local_refuses_a_wrong_scene_or_number_of_ranks(checkout, variables, err
 def test_large_job_fits_the_scene():
     # Every rank has planes, and the ranks of a node fit its memory. The comment names the most ranks of later stages.
     from eddies.scene.scene import load_scene
-    from eddies.workflows.resources import flow_memory, most_ranks
+    from eddies.workflows.estimates import flow_memory, most_ranks
     text = (CHECKOUT / "jobs/hit-paper.slurm.sh").read_text()
     scene, asked = load_scene("hit-paper"), dict(re.findall(r"^#SBATCH --([a-z-]+)=(\S+)", text, re.MULTILINE))
     on_node = int(asked["ntasks-per-node"])

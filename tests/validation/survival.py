@@ -25,13 +25,13 @@ from mpi4py import MPI
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent / "workflows"), str(HERE.parents[1])]
 
-from test_dns_restart import SPLIT  # noqa: E402
-from test_train_restart import SHORT  # noqa: E402
+from test_dns import SPLIT  # noqa: E402
+from test_train import SHORT  # noqa: E402
 
 from eddies.io.checkpoint import CheckpointDirectory  # noqa: E402
 from eddies.pipeline import STAGES  # noqa: E402
 from eddies.scene.scene import load_scene  # noqa: E402
-from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, stage_fingerprint  # noqa: E402
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint  # noqa: E402
 from mpi_tools.launch import mpi_environment, mpirun_command  # noqa: E402
 from tests.small_scene import TINY  # noqa: E402
 
@@ -85,7 +85,7 @@ def kills(stage, ranks, count, directory, chooser):
     shutil.copytree(begin, whole)
     start(stage, whole, overrides, ranks).wait()
     truth = product(whole / file)
-    settings = stage_fingerprint(load_scene(TINY, overrides), stage, DURATION_KEYS.get(stage, ()))
+    settings = stage_fingerprint(load_scene(TINY, overrides), stage, STAGES[stage].duration)
     checkpoints = CheckpointDirectory(MPI.COMM_SELF, run / STAGES[stage].checkpoints, settings)
     while seen["kills"] < count:
         if not run.exists():

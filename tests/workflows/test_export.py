@@ -14,6 +14,7 @@ from eddies.io.trajectories import Trajectory
 from eddies.workflows import export
 from eddies.workflows.rollout.measured import open_rollout
 
+from tests.commands import first_rank
 from tests.changed_product import changed
 from tests.vtk_reader import VtkFile
 from tests.workflows.synthetic_run import write_run
@@ -52,10 +53,7 @@ def compare(path, group, source):
 def test_every_series_of_a_run(comm, tmp_path):
     """Stored and computed ones, with density on one rank; a second export replaces the first."""
     density = comm.size == 1
-    if comm.rank == 0:
-        write_run(MPI.COMM_SELF, tmp_path, truth={"cells": 8}, total=100, frames=6,
-                  density=density)
-    comm.Barrier()
+    first_rank(comm, write_run, MPI.COMM_SELF, tmp_path, truth={"cells": 8}, total=100, frames=6, density=density)
     for _ in range(1 + (comm.size == 1)):
         export.run(tmp_path, tmp_path / "vtkhdf", comm)
     if comm.rank == 0:
@@ -102,9 +100,7 @@ def test_all_series_of_a_run_from_tracks_have_the_units_of_the_file(comm, tmp_pa
 @pytest.mark.mpi(2)
 def test_particles_as_data_sets(comm, tmp_path, caplog):
     """The truth has too few frames."""
-    if comm.rank == 0:
-        write_run(MPI.COMM_SELF, tmp_path, total=100, frames=11)
-    comm.Barrier()
+    first_rank(comm, write_run, MPI.COMM_SELF, tmp_path, total=100, frames=11)
     with caplog.at_level(logging.INFO, logger="eddies"):
         export.run(tmp_path, tmp_path / "sets", comm, "lagrangebench")
     if comm.rank == 0:

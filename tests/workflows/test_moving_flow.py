@@ -12,6 +12,7 @@ from eddies.io.weights import load_weights
 from eddies.scene.scene import load_scene
 from eddies.workflows import simulate, train
 from eddies.workflows.rollout.measured import open_rollout
+from tests.commands import first_rank
 from tests.changed_product import changed
 from tests.workflows.small_rollout import prepared
 
@@ -46,10 +47,7 @@ def boost(comm, path):
 def truths(comm, tmp_path):
     """Two directories with the same ground truth, at rest and moving. The first has the scene."""
     prepared(comm, tmp_path / "still", overrides=OVERRIDES, model='[model]\npreset = "resolved"')
-    comm.Barrier()
-    if comm.rank == 0:
-        shutil.copytree(tmp_path / "still", tmp_path / "moving")
-    comm.Barrier()
+    first_rank(comm, shutil.copytree, tmp_path / "still", tmp_path / "moving")
     boost(comm, tmp_path / "moving/ground_truth.h5")
     return [tmp_path / "still", tmp_path / "moving"]
 

@@ -20,7 +20,7 @@ from eddies.stored_run import open_run
 from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.learned.training_data import training_data
-from tests.commands import run_cli
+from tests.commands import first_rank, run_cli
 from tests.left_out import leave_out_figures
 from tests.small_scene import TINY
 
@@ -88,7 +88,7 @@ def check_words(path, dataset):
 def test_what_check_foresees_is_what_was_run(run_directory):
     from eddies.workflows.estimates import estimate
     from eddies.workflows.ground_truth.frame_counts import unfiltered_frames
-    from eddies.workflows.resources import rollout_bytes, storage, trajectory_bytes
+    from eddies.workflows.estimates import rollout_bytes, storage, trajectory_bytes
     scene = load_scene(TINY, CHANGES)
     with h5py.File(run_directory / "rollout.h5") as file:
         stored = len(file["particles/model/time"])
@@ -174,9 +174,7 @@ def test_a_trained_model_runs_on_another_flow(comm, run_directory, tmp_path):
     """At twice the Mach number, with the scales of that flow only."""
     slower = load_scene(TINY, ["flow.sound_speed=11", "seed=2", "spin_up.turnovers=0.5", "tracers.turnovers=0.25",
                                "kernel.steps=4", "simulation.turnovers=0.1", f"model.path={run_directory}"])
-    if comm.rank == 0:
-        (tmp_path / "slower.toml").write_text(dataclasses.replace(slower, training=None).to_toml())
-    comm.Barrier()
+    first_rank(comm, (tmp_path / "slower.toml").write_text, dataclasses.replace(slower, training=None).to_toml())
     assert run_cli("run", tmp_path / "slower.toml", "--output", tmp_path / "run") == 0
     comm.Barrier()
     with h5py.File(run_directory / "model.h5") as trained, h5py.File(tmp_path / "run" / "model.h5") as adopted:

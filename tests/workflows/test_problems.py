@@ -2,7 +2,6 @@
 what only the flow tells."""
 
 import dataclasses
-import functools
 import logging
 import re
 
@@ -13,12 +12,12 @@ from eddies import write_tracks
 from eddies.scene.integrators import SCHEMES
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 from eddies.scene.terms import FilteredEquations, StepUnits
-from eddies.workflows.ground_truth.frame_counts import check_frames
+from eddies.workflows.estimates import storage
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.problems import check_ground_truth, convenient, memory_of_node, problems
-from eddies.workflows.resources import storage
 from eddies.workflows.tracks import with_tracks
 from eddies.workflows.variants import steps
+from tests.commands import first_rank
 from tests.bad_scenes import INFEASIBLE
 from tests.changed_product import changed
 from tests.small_scene import TINY, one_model, problems_of, scene_file
@@ -272,9 +271,7 @@ def test_files_that_do_not_fit(comm, tmp_path):
     start = ["initial.kind=file", f"initial.path={path}/start.h5", "realisations=[7]"]
     own, other = problems_of(load_scene(TINY, start, ["initial.peak_wavenumber"]), comm)[0]
     assert f"{path}/start.h5" in own and f"{path}/realisation-7/start.h5" in other
-    if comm.rank == 0:
-        (tmp_path / "model.h5").write_text("nothing")
-    comm.Barrier()
+    first_rank(comm, (tmp_path / "model.h5").write_text, "nothing")
     (line,), _ = problems_of(load_scene("hit-mt008", [f"model.path={path}"], ["variant"]), comm)
     assert f"{path}/model.h5" in line
 
@@ -348,8 +345,8 @@ def test_a_ground_truth_with_too_few_frames_or_without_motion(comm, tmp_path):
     write_ground_truth(comm, tmp_path, frames=30)
 
     def check(stages, simulation=scene.simulation):
-        check_ground_truth(tmp_path / "ground_truth.h5", stages, simulation, functools.partial(
-            check_frames, stages, scene.tracers, scene.training, simulation, scene.training.window), comm)
+        given = dataclasses.replace(scene, simulation=simulation)
+        check_ground_truth(tmp_path / "ground_truth.h5", stages, given, comm)
 
     check(["train", "simulate"])
     with pytest.raises(SceneError, match="but there is none from frame 14 of 30 on"):

@@ -20,7 +20,7 @@ from eddies.workflows.variants import steps
 from tests.small_scene import TINY, problems_of
 from tests.workflows.contents import assert_same
 from tests.workflows.stopping import StopAtStep
-from tests.workflows.test_dns_restart import SPLIT, product
+from tests.workflows.test_dns import SPLIT, product
 
 SETS = ["tracers.few.particles_per_side=4", "tracers.few.filter_width=1.2", "tracers.whole.filtered=false",
         "tracers.whole.seed=3"]
@@ -62,7 +62,6 @@ def with_variants(folder, **sets):
     return folder / "several.toml"
 
 
-@pytest.mark.mpi(1)
 def test_variants_use_the_sets(tmp_path):
     scene = load_scene(with_variants(tmp_path, a="few", b="other", c="few"), [
         *SPLIT, *SETS, "tracers.other.seed=2", "realisations=[7]", "simulation.step=converged"])
@@ -86,7 +85,6 @@ def test_variants_use_the_sets(tmp_path):
         given.check_unseen(tmp_path)
 
 
-@pytest.mark.mpi(1)
 def test_realisations_of_sets_alone_are_ground_truths(tmp_path):
     scene = load_scene(TINY, [*SPLIT, *SETS, "realisations=[7]"])
     assert [(step.directory.name, step.stages) for step in steps(scene, scene.stages_of_all, tmp_path)] == [
@@ -167,8 +165,7 @@ def test_sets_are_read_and_written(comm):
     assert stage_fingerprint(longer.tracer_sets["few"], "dns") != stage_fingerprint(chosen, "dns")
 
 
-@pytest.mark.mpi(1)
-def test_written_sets_are_read_back(comm, tmp_path):
+def test_written_sets_are_read_back(tmp_path):
     scene = load_scene(TINY, [*SPLIT, *SETS, "tracers.same={}", "tracers.few.field_cells=none"])
     assert scene.tracers.field_cells == 8 and scene.tracers.sets["few"].field_cells is None
     path = tmp_path / "scene.toml"
@@ -177,7 +174,6 @@ def test_written_sets_are_read_back(comm, tmp_path):
     assert load_scene(path, ["tracers.turnovers=0.2"]).tracers.sets["few"].turnovers == 0.2
 
 
-@pytest.mark.mpi(1)
 @pytest.mark.parametrize("keys, complaint", [
     (["tracers.few.turnovers=3"], r"\[tracers.few\] turnovers: not a key of a set; .* all keys .* except partic"),
     (["tracers.few.filter_width=-1"], r"\[tracers.few\] filter_width = -1: must be a number above 0"),
@@ -199,8 +195,7 @@ def test_a_program_gives_sets_as_tables_or_objects():
         Tracers(particles_per_side=5, turnovers=2.0, frame_interval=0.1, sets={"few": 3})
 
 
-@pytest.mark.mpi(1)
-def test_wrong_variants_are_refused(tmp_path):
+def test_wrong_variants_and_other_stages_are_refused(tmp_path):
     with pytest.raises(SceneError, match=r"\[tracers\]: set few: a variant has this name; choose another"):
         load_scene(with_variants(tmp_path, few="few"), [*SPLIT, *SETS])
     path = with_variants(tmp_path, a="few")
@@ -208,8 +203,5 @@ def test_wrong_variants_are_refused(tmp_path):
     with pytest.raises(SceneError, match=r'"a": works on one set of tracers; .* key variant.a.tracers.set, or'):
         load_scene(path, [*SPLIT, *SETS])
 
-
-@pytest.mark.mpi(1)
-def test_other_stages_need_one_set():
     with pytest.raises(SceneError, match="`eddies train` works on one set of tracers; .*: few, whole"):
         load_scene(TINY, [*SPLIT, *SETS]).check_stages(["train"])

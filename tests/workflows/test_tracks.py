@@ -12,6 +12,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import export, tracks
 from eddies.workflows.ground_truth.track_frames import read_measured
+from tests.commands import first_rank
 from tests.workflows.small_rollout import prepared
 
 MILLIMETRES, MILLISECONDS = 20.0, 4.0  # edge of the box, and the time unit of the file in that of the flow
@@ -46,9 +47,7 @@ def twin(comm, shared_folder):
 
 
 def scene_of(comm, folder, text, name="mine.toml"):
-    if comm.rank == 0:
-        (folder / name).write_text(text)
-    comm.Barrier()
+    first_rank(comm, (folder / name).write_text, text)
     return load_scene(folder / name)
 
 
@@ -117,27 +116,6 @@ def test_times_become_equal_ones_and_a_gap_is_named(comm, tmp_path):
 
 
 @pytest.mark.mpi(1)
-def test_densities_make_a_compressible_ground_truth(comm, tmp_path, twin):
-    with h5py.File(twin / "ground_truth.h5") as file:
-        arrays = {name: file[f"particles/tracers/{column}/value"][()] for name, column in ARRAYS.items()}
-        true = dict(file["reference"].attrs)
-    np.savez(tmp_path / "own.npz", **arrays)
-    scene = scene_of(comm, tmp_path, f"""[tracks]
-path = "{tmp_path / 'own.npz'}"
-interval = 0.02
-filtered = true
-box = {2 * np.pi}
-sound_speed = 15.0
-""")
-    scene = tracks.with_tracks(scene, comm)
-    tracks.run(scene, comm, tmp_path)
-    with h5py.File(tmp_path / "ground_truth.h5") as file:
-        found = dict(file["reference"].attrs)
-    for name in ("density_rms", "density_rate_rms", "velocity_rms", "acceleration_rms", "mach_turbulent"):
-        assert found[name] == pytest.approx(true[name], rel=0.05), name
-
-
-@pytest.mark.mpi(1)
 @pytest.mark.parametrize("text, error, words", [
     (SECTION, ProductError, "missing.csv: no such file"),
     (SECTION.replace("20.0", "19.0"), ProductError, "outside the box from .* to .19"),
@@ -168,12 +146,14 @@ def test_layouts_of_the_scene_are_those_that_can_be_read():
 
 @pytest.mark.mpi(1)
 def test_data_as_published_are_trained_on_end_to_end(comm, tmp_path, no_figures, quick_spectra):
-    """16^3 particles in arrays pos, vel and rho, the published system, and the measures of Fig. 3."""
+    """16^3 particles in arrays pos, vel and rho, the published system, and the measures of Fig. 3. With densities the
+    ground truth is compressible."""
     prepared(comm, tmp_path / "flow", overrides=[
         "tracers.particles_per_side=16", "flow.cells=24", "tracers.field_cells=24", "tracers.turnovers=0.2"])
     with h5py.File(tmp_path / "flow/ground_truth.h5") as file:
         np.savez(tmp_path / "published.npz", **{
             name: file[f"particles/tracers/{column}/value"][()] for name, column in ARRAYS.items()})
+        true = dict(file["reference"].attrs)
     scene = scene_of(comm, tmp_path, f"""[tracks]
 path = "published.npz"
 interval = 0.02
@@ -191,6 +171,10 @@ steps = 60
 learning_rate = 1e-2
 """, "published.toml")
     run(scene, output=tmp_path / "run", comm=comm)
+    with h5py.File(tmp_path / "run/ground_truth.h5") as file:
+        found = dict(file["reference"].attrs)
+    for name in ("density_rms", "density_rate_rms", "velocity_rms", "acceleration_rms", "mach_turbulent"):
+        assert found[name] == pytest.approx(true[name], rel=0.05), name
     stored = open_run(tmp_path / "run")
     errors = stored["model/a_priori"]
     assert np.all(np.asarray(errors["acceleration_error"]) < 0.95)  # without a model it is 1
@@ -365,18 +349,7 @@ def test_a_volume_has_no_images(comm, tmp_path):
     write_tracks(tmp_path / "a.h5", [0, 1, 2], [0, 0, 0], [[0.1, 0.5, 0.5], [0.8, 0.5, 0.5], [0.1, 0.5, 0.5]])
     found = read_measured(scene_of(comm, tmp_path, '[tracks]\npath = "a.h5"\nvolume = [0, 1, 0, 1, 0, 1]\n'
                                                    'margin = 0.1\n').tracks)
-    assert found.frame(0)["velocity"][0, 0] * found.unit == pytest.approx(1.4, rel=1e-3)
-
-
-def uniform_tracks(comm, folder, wind, given, seed=1):
-    """A file with 100 tracks that all move with the same `wind` (3,), with or without their velocities."""
-    if comm.rank == 0:
-        times, start = 0.01 * np.arange(5), np.random.default_rng(seed).random((100, 3))
-        position = start + np.multiply.outer(times, wind)[:, None]
-        velocity = np.broadcast_to(wind, position.shape).reshape(-1, 3) if given else None
-        write_tracks(folder / "uniform.h5", np.repeat(times, 100), np.tile(np.arange(100), 5),
-                     position.reshape(-1, 3) % 1, velocity, edge=1.0)
-    comm.Barrier()
+    assert found.frame(0)["velocity"][0, 0] * found.about["length_unit"] == pytest.approx(1.4, rel=1e-3)
 
 
 @pytest.mark.mpi(1, 2)
@@ -384,11 +357,20 @@ def uniform_tracks(comm, folder, wind, given, seed=1):
     ((1.0, 0.5, -0.2), False, "memory"), ((0.0, 0.0, 0.0), True, "least-squares")])
 def test_tracks_that_move_alike_have_a_uniform_field_and_no_relative_error(comm, tmp_path, no_figures, caplog, wind,
                                                                            given, method):
-    uniform_tracks(comm, tmp_path, wind, given)
-    scene = scene_of(comm, tmp_path, f"""[tracks]
-path = "uniform.h5"
-viscosity = 1e-3
-[reconstruction]
+    """A model could learn nothing from them."""
+    if comm.rank == 0:
+        times, start = 0.01 * np.arange(5), np.random.default_rng(1).random((100, 3))
+        position = start + np.multiply.outer(times, wind)[:, None]
+        velocity = np.broadcast_to(wind, position.shape).reshape(-1, 3) if given else None
+        write_tracks(tmp_path / "uniform.h5", np.repeat(times, 100), np.tile(np.arange(100), 5),
+                     position.reshape(-1, 3) % 1, velocity, edge=1.0)
+    comm.Barrier()
+    section = '[tracks]\npath = "uniform.h5"\nviscosity = 1e-3\n'
+    with pytest.raises(SceneError, match="uniform.h5: all tracks move alike"):
+        tracks.with_tracks(scene_of(comm, tmp_path, section + '[model]\npreset = "resolved"\n[training]\nframes = 2\n'
+                                    "batch = 10\nsteps = 1\n"), comm)
+    comm.Barrier()
+    scene = scene_of(comm, tmp_path, f"""{section}[reconstruction]
 method = "{method}"
 fields = ["velocity", "gradient"]
 """)
@@ -421,15 +403,6 @@ def test_a_noise_that_does_not_fit_gives_a_warning(comm, tmp_path, caplog, facto
                  (position + noise * draw.standard_normal(position.shape)).reshape(-1, 3), edge=1.0)
     read_measured(scene_of(comm, tmp_path, f'[tracks]\npath = "a.h5"\nnoise = {factor * noise}\n').tracks)
     assert [words in line for line in caplog.messages if "noise = " in line] == ([True] if words else [])
-
-
-@pytest.mark.mpi(1)
-def test_tracks_that_move_alike_teach_a_model_nothing(comm, tmp_path):
-    uniform_tracks(comm, tmp_path, (1.0, 0.5, -0.2), True)
-    scene = scene_of(comm, tmp_path, '[tracks]\npath = "uniform.h5"\nviscosity = 1e-3\n[model]\npreset = "resolved"\n'
-                                     '[training]\nframes = 2\nbatch = 10\nsteps = 1\n')
-    with pytest.raises(SceneError, match="uniform.h5: all tracks move alike"):
-        tracks.with_tracks(scene, comm)
 
 
 @pytest.mark.mpi(1, 2)

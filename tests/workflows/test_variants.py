@@ -16,7 +16,7 @@ from eddies.scene.scene import load_scene
 from eddies.workflows import product_warnings, simulate
 from eddies.workflows.rollout.measured import TrueParticles, open_rollout
 from eddies.workflows.variants import rollouts, steps
-from tests.commands import run_cli
+from tests.commands import first_rank, run_cli
 from tests.small_scene import TINY
 from tests.workflows.counting import count_measures
 
@@ -191,10 +191,7 @@ def test_variants_are_run_measured_and_kept(comm, folder, capfd, monkeypatch):
     assert rows["longer-steps"]["status"] == "failed: no such thing" and rows["no-force"]["status"] == "complete"
     before = {path: path.stat().st_mtime_ns for path in out.glob("*/*.h5")}
     capfd.readouterr()
-    comm.Barrier()
-    if comm.rank == 0:
-        (out / "no-force/rollout.h5").unlink()
-    comm.Barrier()
+    first_rank(comm, (out / "no-force/rollout.h5").unlink)
     assert run_cli("run", "small.toml", "--set", "variant.learned.simulation.step=0.04", "--output", "out") == 2
     assert comm.rank > 0 or "(simulation.step = 0.05, now 0.04)" in capfd.readouterr().err
     assert run_cli("run", "small.toml", "--output", "out") == 0
@@ -283,8 +280,5 @@ def test_realisations_that_no_training_has_seen(comm, folder, monkeypatch):
         assert row["energy_ratio"] == pytest.approx(np.mean(both), rel=1e-6)
         assert row["energy_ratio_spread"] == pytest.approx(abs(both[0] - both[1]) / 2**0.5, rel=1e-4)
         assert both[0] != both[1]
-    comm.Barrier()
-    if comm.rank == 0:
-        out.rename(folder / "moved")
-    comm.Barrier()
+    first_rank(comm, out.rename, folder / "moved")
     assert run_cli("simulate", "unseen.toml", "--output", "moved") == 0  # no work of other settings

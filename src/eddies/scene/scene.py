@@ -124,14 +124,8 @@ class Scene(Section):
 
         A scene with sets of tracers has only "dns" and "report", because the other stages need one chosen set.
         """
-        if self.sets:
-            return "dns", "report"
-        learned = self.simulation is None or self.needs_model
-        finds = self.simulation is not None and self.simulation.finds_step
-        return tuple(stage.name for stage in STAGES.values()
-                     if (learned or stage.name != "train") and (finds or stage.name != "find-step")
-                     and (stage.section is None or getattr(self, stage.section) is not None
-                          or stage.name == "dns"))
+        return tuple(stage.name for stage in STAGES.values() if not (self.sets and stage.asked_by)
+                     and all(getattr(self, name) not in (None, False) for name in stage.asked_by))
 
     @property
     def stages_of_all(self) -> tuple[str, ...]:
@@ -148,6 +142,16 @@ class Scene(Section):
         """Whether the rollout needs a trained model: to move the particles, or for the damping of a coarse grid."""
         on_grid = self.eulerian is not None and self.eulerian.form.learned
         return self.simulation is not None and ("model" in self.simulation.form.needs or on_grid)
+
+    @property
+    def uses_model(self) -> bool:
+        """Whether a trained model is wanted: by the rollout, or for itself in a scene without a rollout."""
+        return self.simulation is None or self.needs_model
+
+    @property
+    def finds_step(self) -> bool:
+        """Whether the step of the rollout is to be found."""
+        return self.simulation is not None and self.simulation.finds_step
 
     @property
     def own_training(self) -> Training | None:
@@ -210,8 +214,8 @@ class Scene(Section):
                 if stage == "train" and self.model is not None and self.simulation is not None:
                     raise SceneError(f'{self.name}: [simulation] method = "{self.simulation.method}" needs no trained '
                                      'model; set method = "learned" to train one')
-                raise SceneError(f"{self.name}: `eddies {stage}` needs the section [{STAGES[stage].section}], which is "
-                                 "missing; add it")
+                raise SceneError(f"{self.name}: `eddies {stage}` needs the section [{STAGES[stage].asked_by[0]}], "
+                                 "which is missing; add it")
 
     def check_unseen(self, directory: Path) -> None:
         """Raise SceneError if a variant is trained on one of the realisations in a run directory."""

@@ -9,9 +9,8 @@ from typing import Any
 
 from eddies.parallel.communicator import Comm
 from eddies.scene.scene import Scene, SceneError
-from eddies.workflows.estimates import estimate, measure
+from eddies.workflows.estimates import estimate, in_units, measure, most_disk, most_ranks, storage
 from eddies.workflows.problems import directory_problems, free_disk_at, memory_of_node, problems
-from eddies.workflows.resources import in_units, most_disk, most_ranks, storage
 from eddies.workflows.variants import steps
 
 log = logging.getLogger("eddies")
@@ -66,7 +65,7 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
                       "scratch": needed[0].scratch, "most_ranks": ranks,
                       "least_memory": max(storage(each, stage, ranks, measured).memory for each in scenes)})
         needs += needed
-    particles = tracers and (round(expected.tracks.in_frame) if expected.tracks else tracers.particles)
+    particles = tracers and (round(expected.tracks.mean_count) if expected.tracks else tracers.particles)
     return {
         "scene": scene.name, "stages": list(scene.stages_of_all), "cells": scene.flow.cells,
         "largest_wavenumber": scene.flow.largest_wavenumber,

@@ -32,13 +32,14 @@ from eddies.workflows.ground_truth.flow_run import FlowRun, TracerRun, frame_lay
 from eddies.workflows.ground_truth.frame_counts import unfiltered_frames
 from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
 from eddies.workflows.problems import check_span
-from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, stage_fingerprint, stage_provenance
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 
 log = logging.getLogger("eddies")
 
 
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
-    """Simulate the flow of a scene and write ground_truth.h5: statistics and, with [tracers], frames and fields.
+    """Simulate the flow of a scene and write ground_truth.h5: statistics and, with [tracers], frames and fields. With
+    [tracks] the ground truth is that of the measured tracks (`tracks.run`).
 
     With sets of tracers, each set gets its own ground truth SET/ground_truth.h5, as if it were the only set. The ground
     truth of the run directory then has no tracers.
@@ -50,9 +51,14 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     Raises SceneError if the checkpoint is later than the end of the run, and Stopped, after a checkpoint, if `stop`
     requests it.
     """
+    if scene.tracks is not None:
+        from eddies.workflows import tracks  # imports torch
+        tracks.run(scene, comm, directory, stop)
+        return
     directory, sets = Path(directory), scene.tracer_sets
-    product, course = directory / STAGES["dns"].file, stage_fingerprint(scene, "dns", DURATION_KEYS["dns"])
-    guard = Guard(comm, directory / STAGES["dns"].checkpoints, course, stop)
+    stage = STAGES["dns"]
+    product, course = directory / stage.file, stage_fingerprint(scene, "dns", stage.duration)
+    guard = Guard(comm, directory / stage.checkpoints, course, stop)
     provenance = {**stage_provenance(scene, "dns"), "course": course, "duration": scene.duration}
     saved, kept = checkpoint_to_continue(guard, product, course)
     if saved is not None and kept and scene.tracers is not None:
@@ -140,20 +146,15 @@ def released(flow: FlowRun, scene: Scene, product: Path, saved: Checkpoint | Non
 
 def write_set(path: Path, own: Scene, tracers: TracerRun, name: str) -> None:
     """Write the ground truth of the set of tracers `name`, whose scene is `own`; collective. A file with the same
-    settings is kept, so that products made from it stay valid."""
+    settings is kept, so that products made from it stay valid. So is a scene.toml beside it."""
     comm, flow = tracers.flow.guard.checkpoints.comm, tracers.flow
     if in_files(comm, path, partial(product_fingerprint, path)) == stage_fingerprint(own, "dns"):
         return
-    in_files(comm, path, partial(prepare_set, path.parent, own.to_toml()))
+    scene = path.parent / "scene.toml"
+    in_files(comm, path, lambda: scene.exists() or write_files({scene: own.to_toml()}))
     with create_product(comm, path, "ground_truth", stage_provenance(own, "dns")) as part:
         write_tracers(part, tracers, name, own.forcing)
         write_flow(part, flow, scales_of(tracers.released) | tracers.scales(name), own.spin_up)
-
-
-def prepare_set(directory: Path, text: str) -> None:
-    """Write the scene of a set of tracers to scene.toml in its directory, unless this file exists."""
-    if not (directory / "scene.toml").exists():
-        write_files({directory / "scene.toml": text})
 
 
 def write_tracers(file: File, tracers: TracerRun, name: str, forcing: Forcing | None) -> None:

@@ -15,9 +15,9 @@ from pathlib import Path
 
 from eddies.clock import SAME
 from eddies.errors import UserError
-from eddies.import_path import is_path
 from eddies.flow.initial_fields import SPEEDS
 from eddies.flow.stability import REMEDIES, limits_of_step
+from eddies.import_path import is_path
 from eddies.io.hdf5 import open_product
 from eddies.io.provenance import product_provenance
 from eddies.io.trajectories import Trajectory
@@ -29,12 +29,11 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import (BOX_LENGTH, Flow, Forcing, Initial, Model, Reconstruction, Scene, SceneError,
                                 Simulation, Time, Tracers, Tracks, Training)
 from eddies.scene.terms import StepUnits
-from eddies.workflows.estimates import Estimates, Measured, estimate, expected_scales
+from eddies.workflows.estimates import (Estimates, Measured, Storage, estimate, expected_scales, forces_rollout,
+                                        in_units, most_disk, most_ranks, storage)
 from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.ground_truth.scene_flow import given_spectrum, stored_states
-from eddies.workflows.learned.seen import seen_by, seen_flows, start_within_training
-from eddies.workflows.learned.source import ModelDefinition, read_source
-from eddies.workflows.resources import Storage, forces_rollout, in_units, most_disk, most_ranks, storage
+from eddies.workflows.learned.source import ModelDefinition, read_source, seen_by, seen_flows, start_within_training
 from eddies.workflows.variants import Step
 
 LARGEST_MACH = 0.3           # turbulent Mach number; the relative density fluctuations are about the square of it
@@ -76,12 +75,7 @@ def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = 
         own, stages = step.scene, step.stages
         refused |= dict.fromkeys(f"{own.name}: {problem}" for problem in _infeasible(step, comm, made, measured))
         refused |= dict.fromkeys(directory_problems(stages, comm, step.directory))
-        weights = own.model.weights_file if "train" in stages else None
-        given = weights is not None and weights not in made and on_first_rank(comm, weights.is_file)
-        refused |= dict.fromkeys(_unfit_files(
-            own.initial if "dns" in stages and own.tracks is None else None,
-            ModelDefinition.of(own) if given else None, own.name,
-            own.device if {"train", "simulate"} & {*stages} else "cpu", comm))
+        refused |= dict.fromkeys(_unfit_files(step, comm, made))
         within = on_first_rank(comm, partial(_start_within_training, step, learned))
         for doubt in (*_warnings(step, made, measured), *within):
             doubts.setdefault(doubt, []).append(step.variant or "")
@@ -132,12 +126,11 @@ def _infeasible(step: Step, comm: Comm, made: Collection[Path], measured: Measur
     decays = scene.spin_up is not None and scene.forcing is None
     if tracers is not None and scales is not None and scales["reynolds_lambda"] >= TURBULENT and (
             not decays and truth in made):
-        yield from _too_few_frames(tracers, turnover_time, partial(
-            check_frames, stages, tracers, scene.own_training, scene.simulation, scene.seen_in(directory)))
+        yield from _too_few_frames(scene, stages, turnover_time, scene.seen_in(directory))
     limits = most_ranks(scene.ground_truth_alone if set(stages) == {"dns"} else scene, measured)
     yield from rank_problems(limits, comm.size)
     if "train" in stages and scene.model.path is None and scene.training.truths is not None:
-        from eddies.workflows.learned.truths import truth_problems  # imports torch
+        from eddies.workflows.learned.training_data import truth_problems  # imports torch
         yield from truth_problems(scene.training, tracers, scene.model.reads, truth, comm)
 
 
@@ -191,12 +184,13 @@ def _too_many(key: str, value: float | str, step: float, span: float) -> Iterato
                f"of {MOST_STEPS:.0e}; raise this key, or lower the turnovers or the duration of the run")
 
 
-def _too_few_frames(tracers: Tracers, turnover_time: float, check: Callable[[int], None]) -> Iterator[str]:
-    """Yield a problem if `check` finds too few frames even at the longest possible turnover time."""
+def _too_few_frames(scene: Scene, stages: Sequence[str], turnover_time: float, seen: float) -> Iterator[str]:
+    """Yield a problem if there are too few frames even at the longest possible turnover time."""
+    tracers = scene.tracers
     frames = max(math.ceil(LARGEST_TURNOVER_RATIO * tracers.turnovers * turnover_time / tracers.frame_interval), 1) + 1
     if frames <= MOST_STEPS:
         try:
-            check(frames)
+            check_frames(stages, scene, seen, frames)
         except SceneError as error:
             yield f"[tracers] turnovers = {tracers.turnovers:g} is expected to give at most {frames} frames: {error}"
 
@@ -209,8 +203,8 @@ def directory_problems(stages: Sequence[str], comm: Comm, directory: Path) -> li
             return [f"{directory}: cannot be written; change its permissions, or choose another directory"]
         found = []
         for stage in [STAGES[name] for name in stages]:
-            file, folder = (stage.file, stage.checkpoints) if stage.product is not None else (None, "report")
-            for name, is_directory, makes in ((file, True, "writes a file"), (folder, False, "makes a directory")):
+            for name, is_directory, makes in ((stage.file, True, "writes a file"),
+                                              (stage.folder, False, "makes a directory")):
                 if name and (directory / name).exists() and (directory / name).is_dir() == is_directory:
                     found.append(f"{directory / name}: is a {'directory' if is_directory else 'file'}, and `eddies "
                                  f"{stage.name}` {makes} of this name; move it away, or choose another directory")
@@ -222,25 +216,22 @@ def directory_problems(stages: Sequence[str], comm: Comm, directory: Path) -> li
         return [f"{directory}: cannot be used ({error.strerror}); choose another --output"]
 
 
-def _unfit_files(initial: Initial | None, definition: ModelDefinition | None, name: str, device: str,
-                 comm: Comm) -> Iterator[str]:
-    """Yield a problem if the file of the initial flow or that of trained weights cannot be used, or if `device` does
-    not exist.
-
-    `initial` is None if no flow is started, and `definition` is None if no weights are read. `name` is the name of the
-    scene.
-    """
+def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
+    """Yield a problem if a step needs the file of an initial flow or of trained weights that cannot be used, or a
+    device that does not exist. Weights in `made`, the files that the planned steps write, are not read."""
+    scene, stages = step.scene, step.stages
+    initial, weights = scene.initial, scene.model.weights_file if "train" in stages else None
     try:
-        if initial is not None and initial.flow.from_file:
+        if "dns" in stages and scene.tracks is None and initial.flow.from_file:
             with stored_states(initial, comm):
                 pass
-        if initial is not None and initial.kind == "spectrum":
+        if "dns" in stages and scene.tracks is None and initial.kind == "spectrum":
             given_spectrum(initial, comm)
-        if definition is not None:
-            read_source(name, definition, comm)
-        if device != "cpu":
+        if weights is not None and weights not in made and on_first_rank(comm, weights.is_file):
+            read_source(scene.name, ModelDefinition.of(scene), comm)
+        if scene.device != "cpu" and {"train", "simulate"} & {*stages}:
             from eddies.particles.devices import prepare_torch  # imports torch
-            prepare_torch(device, comm)
+            prepare_torch(scene.device, comm)
     except UserError as error:
         yield str(error)
 
@@ -456,16 +447,15 @@ def check_span(time: Time, now: float, span: float, bound: float, tracers: Trace
         raise SceneError(problem)
 
 
-def check_ground_truth(path: Path, stages: Sequence[str], simulation: Simulation | None,
-                       check: Callable[[int], None], comm: Comm) -> None:
-    """Raise SceneError if a ground truth cannot be used by `stages`; all ranks call it.
+def check_ground_truth(path: Path, stages: Sequence[str], scene: Scene, comm: Comm) -> None:
+    """Raise SceneError if a ground truth cannot be used by `stages` of a scene; all ranks call it.
 
-    The reasons are too few frames, found by `check`; a scale that is 0; and too many steps of the rollout.
+    The reasons are too few frames; a scale that is 0; and too many steps of the rollout.
     """
     with open_product(comm, path, "ground_truth") as file:
         if "particles" not in file:  # measured tracks of which none is in all frames; only fields are made from them
             return
-        check(len(Trajectory(file, "tracers").times))
+        check_frames(stages, scene, scene.seen_in(path.parent), len(Trajectory(file, "tracers").times))
         if {"train", "simulate"} & {*stages}:
             from eddies.workflows.ground_truth.truth import GroundTruth  # imports torch
             truth = GroundTruth(file, comm)
@@ -474,5 +464,5 @@ def check_ground_truth(path: Path, stages: Sequence[str], simulation: Simulation
             except ScaleError as error:
                 raise SceneError(f"{path}: {error}") from None
             turnover_time = truth.reference["eddy_turnover_time"]
-            for problem in _too_many_rollout_steps(simulation, turnover_time) if "simulate" in stages else ():
+            for problem in _too_many_rollout_steps(scene.simulation, turnover_time) if "simulate" in stages else ():
                 raise SceneError(f"{path}: {problem}")

@@ -14,7 +14,7 @@ from eddies.io.hdf5 import File, read_attributes, stored_numbers
 from eddies.io.provenance import product_provenance
 from eddies.pipeline import MAKER_OF, STAGES
 from eddies.scene.scene import Scene, stored_scene
-from eddies.workflows.learned.seen import seen_by, start_within_training
+from eddies.workflows.learned.source import seen_by, start_within_training
 from eddies.workflows.run_directory.work import changed_settings, differences, of_other_settings
 from eddies.workflows.variants import steps
 

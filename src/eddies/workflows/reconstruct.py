@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -38,24 +38,10 @@ from eddies.workflows.ground_truth.track_frames import TrackFrames, count_for
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import load_form
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
-from eddies.workflows.track_solver import (HELD_OUT, NO_FILTER, UniformMethod, best_solver, particles_on, slabs_for,
-                                           solver_of, solving_method, split, validation_error)
+from eddies.workflows.track_solver import (HELD_OUT, NO_FILTER, Method, UniformMethod, best_solver, particles_on,
+                                           slabs_for, solver_of, solving_method, split, validation_error)
 
 log = logging.getLogger("eddies")
-
-
-class Method(Protocol):
-    """Computes the modes (3, kz, ky, kx) of the particles' velocity, frame by frame."""
-
-    def of(self, particles: ParticleSet, time: float) -> Tensor:
-        """Return the modes at a time; collective."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return what the next frame needs from earlier frames: tensors of modes, and plain values."""
-        return {}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state from `state_dict`."""
 
 
 class NeighbourMethod(Method):

@@ -1,27 +1,36 @@
-"""Rollout: particles start at a frame of the ground truth, and the trained model or a baseline moves them."""
+"""Rollout: particles start at a frame of the ground truth, and the trained model or a baseline moves them.
+
+`Course` is the loop over steps and frames, with its checkpoints.
+"""
 
 from __future__ import annotations
 
 import logging
+import time
+from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from eddies.clock import pace_in_words
-from eddies.io.frame_segments import FrameSegments
-from eddies.io.checkpoint import Guard
+from eddies.clock import ROUND_OFF, WARM_UP_STEPS, Clock, ProgressLine, pace_in_words
+from eddies.io.checkpoint import Checkpoint, Guard
+from eddies.io.frame_segments import FrameLayout, FrameSegments, TrajectoryLayout
 from eddies.io.hdf5 import Table, create_product, write_table
 from eddies.io.new_files import set_attributes
 from eddies.parallel.communicator import Comm
+from eddies.parallel.migration import IdOrder, wrap
+from eddies.parallel.reduction import global_sum
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
+from eddies.particles.particle_set import as_numpy
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene
 from eddies.workflows.ground_truth.frame_counts import rollout_start
 from eddies.workflows.ground_truth.truth import open_truth
-from eddies.workflows.rollout.course import Course, frame_layout
-from eddies.workflows.rollout.method import TimeStep, forcing_of, make_method
+from eddies.workflows.rollout.method import Method, TimeStep, forcing_of, make_method
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 from eddies.workflows.run_directory.work import read_found_step, step_path
 
@@ -69,3 +78,122 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     pace = (pace_in_words(outcome["seconds_per_step"], outcome["storing_share"]) if "seconds_per_step" in outcome
             else "too few steps to time")
     log.info("rollout: %.2f turnovers, %s; %s", outcome["time"] / turnover, pace, outcome["status"])
+
+
+def frame_layout(total: int, length: float, density: bool) -> FrameLayout:
+    """Return the layout of the frames of a rollout with `total` particles in a box of edge `length`."""
+    columns = {"position": (3,), "velocity": (3,), "acceleration": (3,)} | ({"density": ()} if density else {})
+    return FrameLayout(length, {"model": TrajectoryLayout(total, columns)}, np.float32, {})
+
+
+class Course:
+    """Runs a method through `count` frame intervals of the length `interval`, from the start or from a checkpoint.
+
+    Frames are written into `segments`. `guard` is called before each step and writes checkpoints. There are no
+    checkpoints if the method has no `state_dict`.
+    """
+
+    def __init__(self, method: Method, segments: FrameSegments, count: int, interval: float, guard: Guard,
+                 saved: Checkpoint | None) -> None:
+        self.method, self.segments, self.count, self.interval, self.guard = method, segments, count, interval, guard
+        self.comm, self.times = segments.comm, []
+        self.clock, self.seconds, self.energy = Clock(count * interval), [], 0.0
+        self._warm_up = WARM_UP_STEPS
+        if saved is not None:
+            self._load(saved)
+            method.load_state_dict(saved)
+            log.info("rollout: continues from step %d, time %.4g", self.steps, self.clock.time)
+        self.progress = ProgressLine("rollout", self._describe, done=self._done)
+
+    @property
+    def steps(self) -> int:
+        """Steps taken so far."""
+        return self.clock.steps
+
+    @property
+    def _done(self) -> float:
+        return min(self.clock.elapsed / self.clock.span, 1.0)
+
+    def run(self) -> dict[str, float | str]:
+        """Advance to the last frame, or until the state is faulty.
+
+        Returns attributes of the product: `status`, the `time` of the last frame, and the number of `steps`. If a step
+        was taken, there are also the mean `time_step`, and `storing_share`, the share of the wall time that storing
+        took. If a step was timed, the attributes of `quartiles` are added.
+        """
+        complaint: str | None = None
+        if not self.times:
+            self._store(0.0)
+        while complaint is None and (number := len(self.times)) <= self.count:
+            until = number * self.interval
+            while complaint is None and self.method.time < until - ROUND_OFF * self.interval:
+                if hasattr(self.method, "state_dict"):
+                    self.guard(self, self.segments)
+                else:
+                    self.guard.stop.check()
+                complaint = self._step(until)
+                self.progress(self._done, self.steps)
+            if complaint is None:
+                self._store(until)
+        if complaint is not None and self.comm.rank == 0:
+            log.warning("rollout stopped at time %.4g: %s", self.clock.time, complaint)
+        step = {"time_step": self.clock.time / self.steps,
+                "storing_share": self.progress.storing_share} if self.steps else {}
+        return {"status": "complete" if complaint is None else f"stopped: {complaint}", "time": self.times[-1],
+                "steps": self.steps, **step, **quartiles(self.seconds)}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state for a checkpoint, without the frames, which have files of their own."""
+        return {"rollout": {"clock": self.clock.state_dict(), "energy": self.energy, "ranks": self.comm.size,
+                            "seconds": self.seconds, "times": self.times},
+                **self.method.state_dict()}
+
+    def _load(self, saved: Checkpoint) -> None:
+        """Restore all but the state of the method."""
+        state = saved["rollout"]
+        self.clock.load_state_dict(state["clock"])
+        self.times, self.energy = state["times"], state["energy"]
+        if state["ranks"] == self.comm.size:  # wall times on another number of ranks differ
+            self.seconds = state["seconds"]
+
+    def _step(self, until: float) -> str | None:
+        began, before = time.perf_counter(), self.method.time
+        complaint = self.method.advance(until, self.steps + 1)
+        if complaint is None:
+            self.clock.tick(self.method.time - before)
+            self._warm_up -= 1
+            if self._warm_up < 0:
+                self.seconds.append(time.perf_counter() - began)
+        return complaint
+
+    def _store(self, at: float) -> None:
+        """Store the frame at the time `at`, and keep the kinetic energy of its particles for the progress line."""
+        layout, own = self.segments.layout, self.segments.layout.trajectories["model"]
+        # The first step uses the forces of the first frame. Later frames evaluate forces for storing only; this time
+        # counts as storing.
+        with self.progress.storing() if self.times else nullcontext():
+            particles, acceleration = self.method.frame(at)
+        with self.progress.storing():
+            columns = {**particles.to_numpy(), "acceleration": as_numpy(acceleration)}
+            columns["position"] = wrap(columns["position"], layout.length)
+            order = IdOrder(self.comm, columns["id"], own.total)
+            self.segments.open(self.steps)
+            self.segments.trajectories["model"].append(self.steps, at, order.start, {
+                name: order.apply(columns[name]) for name in own.columns})
+            self.times.append(at)
+        velocity = particles.velocity.double()
+        first, second = velocity.sum(0), velocity.square().sum(0)
+        mean, square = global_sum(self.comm, as_numpy(torch.stack([first, second]))) / own.total
+        self.energy = float(np.sum(square - mean**2)) / 2  # without the mean velocity
+
+    def _describe(self) -> str:
+        return f"t {self.clock.time:.4g}  energy {self.energy:.4g}{self.method.status()}"
+
+
+def quartiles(seconds: Sequence[float]) -> dict[str, float]:
+    """Return the median of the wall seconds of timed steps, `seconds_per_step`, and their quartiles,
+    `seconds_per_step_low` and `seconds_per_step_high`. Without timed steps the result is empty."""
+    if not seconds:
+        return {}
+    low, median, high = np.quantile(seconds, (0.25, 0.5, 0.75))
+    return {"seconds_per_step": median, "seconds_per_step_low": low, "seconds_per_step_high": high}

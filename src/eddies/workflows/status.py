@@ -15,14 +15,14 @@ from eddies.io.provenance import product_fingerprint, product_provenance
 from eddies.io.run_lock import job_in
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
-from eddies.pipeline import STAGES, Stage
+from eddies.pipeline import MAKER_OF, STAGES, Stage
 from eddies.scene.scene import Scene, SceneError, load_scene
-from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, set_files, stage_fingerprint
-from eddies.workflows.resources import in_units
+from eddies.workflows.estimates import in_units
+from eddies.workflows.run_directory.fingerprints import set_files, stage_fingerprint
 from eddies.workflows.run_directory.work import differences, of_other_settings, stage_seconds
 from eddies.workflows.variants import steps
 
-SCENE, PAGE = "scene.toml", Path("report") / "index.html"
+SCENE = "scene.toml"
 
 
 def run(directory: Path, comm: Comm, verify: bool = False) -> None:
@@ -59,8 +59,8 @@ def _state(path: Path) -> str:
 
 def products_in(directory: Path) -> list[Path]:
     """Return the products of all runs in a directory, sorted by path. A link to one of these products is left out."""
-    names = [stage.file for stage in STAGES.values() if stage.product]
-    found = sorted((path for name in names for path in directory.rglob(name)), key=Path.is_symlink, reverse=True)
+    found = sorted((path for stage in MAKER_OF.values() for path in directory.rglob(stage.file)), key=Path.is_symlink,
+                   reverse=True)
     return sorted({path.resolve(): path for path in found}.values())
 
 
@@ -71,7 +71,7 @@ def _print(comm: Comm, line: str) -> None:
 
 def status_lines(directory: Path) -> Iterator[str]:
     """Yield the lines of all runs in a directory, sorted by path. Raises UserError if the directory holds no run."""
-    is_run = (directory / SCENE).is_file() or any((directory / stage.file).is_file() for stage in STAGES.values())
+    is_run = (directory / SCENE).is_file() or any((directory / stage.file).is_file() for stage in MAKER_OF.values())
     found = [directory] if is_run else sorted(path.parent for path in directory.glob(f"**/{SCENE}"))
     if not found:
         raise UserError(f"{directory}: holds no run; make one with `eddies run SCENE`, or give the directory of one")
@@ -108,7 +108,8 @@ def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
             if lacking and state.startswith("complete"):
                 state = f"lacks the ground truth of {', '.join(lacking)}"
             rows.append((prefix + name, seconds.get(name), state))
-    page, products = directory / PAGE, [step.directory / STAGES[name].file for step in planned for name in step.stages]
+    page = directory / STAGES["report"].file
+    products = [step.directory / STAGES[name].file for step in planned for name in step.stages]
     state = "to do"
     if page.is_file():
         old = any(path.stat().st_mtime > page.stat().st_mtime for path in products if path.is_file())
@@ -131,7 +132,7 @@ def stage_state(stage: Stage, directory: Path, scene: Scene) -> str:
     except ProductError as error:
         return str(error)
     if checkpoints and origin.get("course") not in [fingerprint for _, fingerprint in checkpoints]:
-        continued = stage_fingerprint(scene, stage.name, DURATION_KEYS.get(stage.name, ()))
+        continued = stage_fingerprint(scene, stage.name, stage.duration)
         fits = continued in [fingerprint for _, fingerprint in checkpoints]
         return f"stopped at step {checkpoints[0][0]}, {'can continue' if fits else 'with other settings'}"
     if not product.is_file():

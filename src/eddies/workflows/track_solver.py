@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -30,7 +30,21 @@ MIXING = ((30, 0xbf58476d1ce4e5b9), (27, 0x94d049bb133111eb), (31, 1))
 NO_FILTER = 1e-3        # filter width divided by the spacing, for an unfiltered flow
 
 
-class UniformMethod:
+class Method(Protocol):
+    """Computes the modes (3, kz, ky, kx) of the particles' velocity, frame by frame."""
+
+    def of(self, particles: ParticleSet, time: float) -> Tensor:
+        """Return the modes at a time; collective."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what the next frame needs from earlier frames: tensors of modes, and plain values."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore a state from `state_dict`."""
+
+
+class UniformMethod(Method):
     """Gives the modes of a velocity that is the same at all particles."""
 
     def __init__(self, solver: ResolvedVelocity) -> None:
@@ -40,14 +54,8 @@ class UniformMethod:
         mean = mean_over_ranks(self._grid.decomposition.comm, particles.velocity)
         return self._grid.with_mean(self._grid.zeros(3), mean)
 
-    def state_dict(self) -> dict[str, Any]:
-        return {}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Do nothing: there is no state."""
-
-
-class LeastSquaresMethod:
+class LeastSquaresMethod(Method):
     """Fits the modes to each frame alone by least squares. The solve starts from the modes of the previous frame."""
 
     def __init__(self, solver: ResolvedVelocity) -> None:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -31,7 +30,7 @@ from eddies.particles.flow_units import measured_scales, planes_for
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.pipeline import STAGES
-from eddies.scene.scene import BOX_LENGTH, Flow, Model, Scene, SceneError, Simulation, Tracers
+from eddies.scene.scene import BOX_LENGTH, Flow, Scene, SceneError, Tracers
 from eddies.scene.sections import Eulerian, Initial, Reconstruction, Tracks
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.workflows.ground_truth.flow_run import write_spectra
@@ -66,8 +65,7 @@ def with_tracks(scene: Scene, comm: Comm) -> Scene:
         if each.realisations is not None:
             raise SceneError(f"realisations = {[*each.realisations]}: the file has one realisation; remove the key, "
                              "and write a scene for each file")
-        uses = [f"[{section}]" for section in ("kernel", "model", "simulation") if getattr(each, section) is not None]
-        for problem in _unfit(settings, uses, each.reconstruction, each.model, each.simulation, each.eulerian):
+        for problem in _unfit(each):
             raise SceneError(problem)
     learned = any(part is not None for part in (scene.kernel, scene.model, scene.simulation))
     found = in_files(comm, settings.file, lambda: _sections_of(settings, learned))
@@ -78,10 +76,10 @@ def with_tracks(scene: Scene, comm: Comm) -> Scene:
     return replace(scene, **found, variant={name: replace(each, **found) for name, each in scene.variant.items()})
 
 
-def _unfit(settings: Tracks, learned: Sequence[str], wanted: Reconstruction | None, model: Model | None,
-           simulation: Simulation | None, eulerian: Eulerian | None) -> Iterator[str]:
-    """Yield a message for each setting that cannot be used with tracks. `learned` names those sections among [kernel],
-    [model] and [simulation] that the scene has."""
+def _unfit(scene: Scene) -> Iterator[str]:
+    """Yield a message for each setting of a scene that cannot be used with tracks."""
+    settings, wanted, model, simulation = scene.tracks, scene.reconstruction, scene.model, scene.simulation
+    learned = [f"[{section}]" for section in ("kernel", "model", "simulation") if getattr(scene, section) is not None]
     if wanted is not None:
         if settings.viscosity is None and (wanted.method == "memory" or "acceleration" in wanted.fields):
             yield ("[tracks] viscosity: this key is missing, and the method memory and the acceleration need it; give "
@@ -102,7 +100,7 @@ def _unfit(settings: Tracks, learned: Sequence[str], wanted: Reconstruction | No
     if simulation is not None and simulation.form.on_grid:
         if settings.viscosity is None:
             yield '[tracks] viscosity: this key is missing, and [simulation] method = "eulerian" needs it; give it'
-        if (eulerian or Eulerian()).start != "particles":
+        if (scene.eulerian or Eulerian()).start != "particles":
             yield ('[eulerian] start = "flow": measured tracks do not give the unfiltered flow; set start = '
                    '"particles"')
 
@@ -120,14 +118,14 @@ def _sections_of(settings: Tracks, learned: bool) -> dict[str, Flow | Tracers]:
     count = present if learned else max(count_for(tracks.spacing), LEAST_TRACKS)
     speed = float(np.sqrt(np.mean(fluctuations(tracks.columns["velocity"])**2)))
     turnover = INTEGRAL_SCALE * BOX_LENGTH / speed if speed > 0 else math.inf
-    width = None if settings.filter_width is None else settings.filter_width / tracks.unit
+    width = None if settings.filter_width is None else settings.filter_width / tracks.about["length_unit"]
     tracers = Tracers(count=count, filtered=settings.filtered or learned, frame_interval=float(tracks.times[1]),
                       filter_width=width, turnovers=max(float(tracks.times[-1] / turnover), 1e-6),
                       field_every=settings.field_every)
-    viscosity = 0.0 if settings.viscosity is None else settings.viscosity / tracks.unit**2
+    viscosity = 0.0 if settings.viscosity is None else settings.viscosity / tracks.about["length_unit"]**2
     cells, sound = max(tracers.cells, planes_for(tracers.particles), LEAST_CELLS), settings.sound_speed
     flow = Flow(fluid="incompressible", cells=cells, viscosity=viscosity) if sound is None else Flow(
-        fluid="compressible", cells=cells, viscosity=viscosity, sound_speed=sound / tracks.unit)
+        fluid="compressible", cells=cells, viscosity=viscosity, sound_speed=sound / tracks.about["length_unit"])
     return {"flow": flow, "tracers": tracers}
 
 
@@ -142,7 +140,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     """
     tracks, viscosity = TrackFrames(comm, scene.tracks), scene.flow.viscosity
     follows = scene.tracers.filtered and not scene.tracks.filtered
-    flows = FittedFlows.of(tracks, scene.tracers, scene.tracks.filtered, viscosity, follows)
+    flows = FittedFlows(tracks, scene.tracers, scene.tracks.filtered, viscosity, follows)
     with create_product(comm, Path(directory) / STAGES["dns"].file, "ground_truth",
                         stage_provenance(scene, "dns")) as file:
         paths, rows, spectra = write_frames(file, flows, tracks, scene.tracers, viscosity, follows, stop)
@@ -204,48 +202,36 @@ def write_frames(file: File, flows: FittedFlows, tracks: TrackFrames, tracers: T
     return paths, rows, dict(zip(("time", "energy", "filtered"), map(np.array, zip(*spectra))))
 
 
-@dataclass(frozen=True)
 class FittedFlows:
-    """The velocity fields of measured tracks, by one method for all frames.
+    """The velocity fields of measured tracks, by one method for all frames, which the first frame determines. The
+    constructor is collective.
 
     slab, grid, method: the slabs, the grid, and the method that finds the modes of a frame. reference: the scales of
     the flow in the first frame. weight, error: the weight of the noise, and the error at left-out tracks, NaN if it was
     not measured. filtered, filter_width: as in `FrameFlow`.
     """
 
-    slab: SlabDecomposition
-    grid: FourierGrid
-    method: Any
-    reference: dict[str, float]
-    weight: float
-    error: float
-    filtered: bool
-    filter_width: float
-
-    @classmethod
-    def of(cls, tracks: TrackFrames, tracers: Tracers, filtered: bool, viscosity: float,
-           follows: bool) -> FittedFlows:
-        """Choose the method by the first frame; collective."""
+    def __init__(self, tracks: TrackFrames, tracers: Tracers, filtered: bool, viscosity: float, follows: bool) -> None:
         settings = Reconstruction(method="memory" if follows and viscosity > 0 else "least-squares")
+        self.filtered, self.filter_width = filtered, tracers.filter_width
         own = tracers.with_count(count_for(tracks.spacing))
         known = {"filter_width": tracers.filter_width, "spacing": tracers.spacing, "density_mean": 1.0,
                  "viscosity": viscosity,
                  **measured_scales(tracks.comm, tracks.shared(0, 1), tracks.shared(1, 0), tracks.times[1])}
         width = tracers.filter_width if filtered else NO_FILTER * tracks.spacing
-        found = {"kolmogorov_length": 0.0} | known
+        self.reference = {"kolmogorov_length": 0.0} | known
         # The first pass does not know the Kolmogorov length. The prior of the second pass uses that of the first pass.
         for resolved in (own, settings.resolving(own, filtered))[:2 if viscosity > 0 else 1]:
-            slab = slabs_for(tracks.comm, own, resolved, width, found["kolmogorov_length"])
-            particles = particles_on(slab, tracks.frame(0))
-            make = partial(solver_of, slab, found | {"spacing": resolved.spacing, "filter_width": width})
-            solver, weight, error = best_solver(particles, make, uniform=tracks.uniform)
-            first = UniformMethod(solver) if tracks.uniform else LeastSquaresMethod(solver)
-            flow = FrameFlow(solver.grid, first.of(particles, 0.0), particles, filtered, tracers.filter_width)
-            found = flow.scales(viscosity) | known  # velocity_rms is that of the particles
-        # A memory is of an unfiltered flow: G = 1.
-        method = UniformMethod(solver) if tracks.uniform else solving_method(
-            settings, solver, viscosity, torch.ones_like(solver.grid.shell), weight)
-        return cls(slab, solver.grid, method, found, weight, error, filtered, tracers.filter_width)
+            self.slab = slabs_for(tracks.comm, own, resolved, width, self.reference["kolmogorov_length"])
+            make = partial(solver_of, self.slab, self.reference | {"spacing": resolved.spacing, "filter_width": width})
+            solver, self.weight, self.error = best_solver(particles_on(self.slab, tracks.frame(0)), make,
+                                                          uniform=tracks.uniform)
+            self.grid = solver.grid
+            self.method = UniformMethod(solver) if tracks.uniform else LeastSquaresMethod(solver)
+            # The velocity_rms is that of the particles.
+            self.reference = self.at(tracks.frame(0), 0.0).scales(viscosity) | known
+        if not tracks.uniform:  # a memory is of an unfiltered flow: G = 1
+            self.method = solving_method(settings, solver, viscosity, torch.ones_like(solver.grid.shell), self.weight)
 
     @torch.no_grad()
     def at(self, columns: Columns, time: float) -> FrameFlow:

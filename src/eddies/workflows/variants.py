@@ -14,18 +14,17 @@ Each directory is a complete run directory: products that are made elsewhere wit
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from eddies.pipeline import STAGES
+from eddies.pipeline import MAKER_OF, STAGES
 from eddies.scene.scene import REALISATION, Scene
 from eddies.workflows.run_directory.fingerprints import set_files, stage_fingerprint
 
-# Stages whose products variants share if their settings agree.
-SHARED = ("dns", "train-kernel", "reconstruct")
+SHARED = tuple(stage.name for stage in STAGES.values() if stage.shared)
 # Stages that make a product.
-MAKING = tuple(stage.name for stage in STAGES.values() if stage.product is not None)
+MAKING = tuple(stage.name for stage in MAKER_OF.values())
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,6 @@ class Step:
     directory : where they run.
     variant : name of the variant; None for products that all variants share.
     links : the directories of the products that are made elsewhere and linked here, by stage.
-    files : the files of the products that the stages make.
     """
 
     scene: Scene
@@ -47,7 +45,13 @@ class Step:
     directory: Path
     variant: str | None = None
     links: Mapping[str, Path] = field(default_factory=dict)
-    files: tuple[Path, ...] = ()
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The product files that the stages make. The stage "dns" also makes one in the directory of each set of
+        tracers."""
+        of_sets = [self.directory / name / STAGES["dns"].file for name in self.scene.sets if "dns" in self.stages]
+        return *(self.directory / STAGES[stage].file for stage in self.stages), *of_sets
 
 
 def rollouts(scene: Scene, directory: Path) -> dict[str, dict[Path, Scene]]:
@@ -83,7 +87,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
     """
     if not scene.variant and not scene.realisations:
         making = tuple(stage for stage in stages if stage in MAKING)
-        return [Step(scene, making, directory, files=_files(making, directory, scene.sets))] if making else []
+        return [Step(scene, making, directory)] if making else []
     seeds = scene.realisations or ()
     found: list[Step] = []
     made: dict[tuple[str, str], Path] = {}
@@ -104,7 +108,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
                              for path, fingerprint in set_files(own).items()}
                 working += [stage] if stage in stages else []
         if working:
-            found.append(Step(own, tuple(working), where, name, links, _files(working, where, own.sets)))
+            found.append(Step(own, tuple(working), where, name, links))
     return found
 
 
@@ -145,10 +149,3 @@ def _planned(scene: Scene, directory: Path,
         planned += [(name, own, where, (*SHARED, *(("train",) if seeds else ()), "simulate"))
                     for name, (where, own) in zip(chosen, together)]
     return planned
-
-
-def _files(stages: Sequence[str], directory: Path, sets: Collection[str]) -> tuple[Path, ...]:
-    """Return the product files that the stages make in a directory. The stage "dns" also makes a file in the directory
-    of each of the sets of tracers `sets`."""
-    of_sets = [directory / name / STAGES["dns"].file for name in sets if "dns" in stages]
-    return *(directory / STAGES[stage].file for stage in stages), *of_sets

@@ -41,7 +41,7 @@ def test_the_field_loss_uses_frames_with_a_field_one_frame_later():
         scene = load_scene("hit-small", ["training.field_target=flow", "training.window=0.5",
                                          f"tracers.field_every={every}"])
         with pytest.raises(SceneError, match=f"field_target.*{which}; lower .tracers. field_every"):
-            check_frames(["train"], scene.tracers, scene.training, scene.simulation, scene.training.window, FRAMES)
+            check_frames(["train"], scene, scene.training.window, FRAMES)
 
 
 @pytest.mark.parametrize("frames, every", [

@@ -12,6 +12,7 @@ from eddies.flow.statistics import energy_spectrum
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows.ground_truth.scene_flow import build_fluid, initial_state
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
+from tests.commands import first_rank
 from tests.small_scene import problems_of
 
 STORED, CELLS = 12, 16
@@ -196,9 +197,7 @@ def test_an_unfit_file_is_refused_by_check_and_run(comm, path):
 def test_a_flow_starts_from_a_spectrum_in_a_text_file(comm, tmp_path):
     path = tmp_path / "spectrum.txt"
     scene = ["flow.cells=16", "initial.kind=spectrum", f"initial.path={path}"]
-    if comm.rank == 0:
-        path.write_text("# k, E(k)\n1 0.5\n4 0.03125  # a power law\n")
-    comm.Barrier()
+    first_rank(comm, path.write_text, "# k, E(k)\n1 0.5\n4 0.03125  # a power law\n")
     scenes = [load_scene("taylor-green", [*scene, f"seed={seed}"]) for seed in (1, 1, 2)]
     first, same, other = (initial_state(each.initial, each.seed, build_fluid(each.flow, None, comm)) for each in scenes)
     energy = energy_spectrum(build_fluid(scenes[0].flow, None, comm).grid, first)
@@ -206,16 +205,10 @@ def test_a_flow_starts_from_a_spectrum_in_a_text_file(comm, tmp_path):
     assert np.array_equal(first, same) and (first.size == 0 or not np.allclose(first, other))
     for content, message in {"1 2 3\n4 5 6\n": "has 3 columns", "1 a\n": "holds no spectrum", "1 1\n": "at least two",
                              "2 1\n1 1\n": "ascending", "1 nan\n2 1\n": "not finite", "": "columns"}.items():
-        comm.Barrier()
-        if comm.rank == 0:
-            path.write_text(content)
-        comm.Barrier()
+        first_rank(comm, path.write_text, content)
         (line,), _ = problems_of(scenes[0], comm)
         assert line.startswith(f'[initial] path = "{path}": {path}: ') and message in line
-    comm.Barrier()
-    if comm.rank == 0:
-        path.unlink()
-    comm.Barrier()
+    first_rank(comm, path.unlink)
     (line,), _ = problems_of(scenes[0], comm)
     assert "cannot be read: No such file" in line
     with pytest.raises(SceneError, match='kind = "spectrum" needs the path of a text file'):

@@ -10,6 +10,7 @@ from eddies.io.trajectories import Trajectory
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_field import grid_points
 from eddies.workflows.ground_truth.truth import GroundTruth
+from tests.commands import first_rank
 from tests.changed_product import changed
 from tests.workflows.synthetic_run import LENGTH, write_ground_truth
 
@@ -18,9 +19,7 @@ FRAMES = 5
 
 def written(comm, directory, density=True):
     """The path of a synthetic ground truth."""
-    if comm.rank == 0:
-        write_ground_truth(MPI.COMM_SELF, directory, frames=FRAMES, density=density)
-    comm.Barrier()
+    first_rank(comm, write_ground_truth, MPI.COMM_SELF, directory, frames=FRAMES, density=density)
     return directory / "ground_truth.h5"
 
 

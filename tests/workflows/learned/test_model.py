@@ -168,21 +168,16 @@ def test_all_ranks_take_the_values_of_the_first(comm, caplog):
 @pytest.mark.parametrize("drawn, message", [
     (lambda rank: nn.Parameter(torch.ones(3 + rank)), r"rank 1 has drawn torch.float32 \[4\] where"),
     (lambda rank: nn.Parameter(torch.ones(3), requires_grad=rank == 0), "rank 1 has drawn .* not trained where"),
-    (lambda rank: nn.UninitializedParameter(), "drawn has no shape")], ids=["shape", "fixed", "lazy"])
+    (lambda rank: nn.UninitializedParameter(), "drawn has no shape"),
+    (None, "rank 1 has drawn .* where rank 0 has kept")], ids=["shape", "fixed", "lazy", "order"])
 def test_parameters_that_cannot_be_copied_are_refused(comm, drawn, message):
+    """Also in another order, because gradients are summed over ranks in the order of the parameters."""
     model = parameters(comm.rank)
-    model.drawn = drawn(comm.rank)
-    with pytest.raises(SceneError, match=message):
-        take_from_first_rank(model, comm)
-
-
-@pytest.mark.mpi(2)
-def test_another_order_of_parameters_on_a_rank_is_refused(comm):
-    """Gradients are summed over ranks in the order of the parameters."""
-    model = parameters(0)
-    if comm.rank == 1:
+    if drawn is not None:
+        model.drawn = drawn(comm.rank)
+    elif comm.rank == 1:
         model.register_parameter("kept", model._parameters.pop("kept"))
-    with pytest.raises(SceneError, match="rank 1 has drawn .* where rank 0 has kept"):
+    with pytest.raises(SceneError, match=message):
         take_from_first_rank(model, comm)
 
 

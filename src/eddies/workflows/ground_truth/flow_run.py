@@ -20,8 +20,10 @@ from eddies.io.checkpoint import Block, Checkpoint, Guard
 from eddies.io.flow_states import restored_modes, saved_modes
 from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments, TrajectoryLayout
 from eddies.io.hdf5 import File, Table, write_table
+from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import IdOrder, id_block, migrate
-from eddies.parallel.slab import SlabDecomposition
+from eddies.parallel.reduction import global_sum
+from eddies.parallel.slab import SlabDecomposition, block_starts
 from eddies.particles.flow_units import MEAN_DENSITY, measured_scales
 from eddies.scene.scene import BOX_LENGTH, Tracers
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
@@ -297,3 +299,31 @@ def write_spectra(file: File, name: str, rows: str, columns: Mapping[str, ArrayL
 def series_of(name: str) -> dict[str, str]:
     """Map the names of a set's series in `frame_layout` to their names in the ground truth of this set."""
     return {f"{series}{suffix_of(name)}": series for series in ("tracers", "filtered")} | {"unfiltered": "unfiltered"}
+
+
+def saved_rows(comm: Comm, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Return the columns (n, ...) of this rank as a state for a checkpoint. Rows are stored in the order of the ranks.
+
+    `columns` holds at least `id` and `position`. Collective.
+    """
+    rows = np.zeros(comm.size, np.int64)
+    rows[comm.rank] = len(columns["id"])
+    rows = global_sum(comm, rows)
+    first, total = int(rows[:comm.rank].sum()), int(rows.sum())
+    return {"columns": list(columns), "rows_of_ranks": rows,
+            **{f"particles {name}": Block(column, first, total) for name, column in columns.items()}}
+
+
+def restored_rows(slab: SlabDecomposition, saved: Checkpoint) -> tuple[dict[str, np.ndarray], bool]:
+    """Return the columns of this rank, and whether they are exactly the rows that this rank saved.
+
+    On the same number of ranks each rank reads the rows that it saved, in the same order. Therefore a restart does not
+    change the last bit of a sum over particles. On another number of ranks the columns are those of the particles in
+    this rank's slab. Collective.
+    """
+    rows = saved["rows_of_ranks"]
+    same = len(rows) == slab.size
+    starts = np.concatenate([[0], np.cumsum(rows)]) if same else block_starts(int(rows.sum()), slab.size)
+    block = int(starts[slab.rank]), int(starts[slab.rank + 1])
+    columns = {name: saved.read(f"particles {name}", *block) for name in saved["columns"]}
+    return (columns if same else migrate(slab, columns)), same

@@ -10,26 +10,22 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from eddies.scene.scene import SceneError, Simulation, Tracers, Training
+from eddies.scene.scene import Scene, SceneError, Simulation, Tracers, Training
 
 HELD_OUT = 0.1               # share of the training window, at its end, that is for validation
 KERNEL_FIELDS = 4            # filtered fields that the kernel is trained on
 TESTED_FRAMES, TESTED_PARTICLES = 9, 20_000  # frames of the a-priori test; particles whose rates it stores
 
 
-def check_frames(stages: Sequence[str], tracers: Tracers, training: Training | None, simulation: Simulation | None,
-                 seen: float, frames: int) -> None:
-    """Raise SceneError if there are too few frames for one of the `stages`.
-
-    `training` is None if the model takes its weights from another run.
-    """
-    field_frames = range(0, frames, tracers.field_every)
+def check_frames(stages: Sequence[str], scene: Scene, seen: float, frames: int) -> None:
+    """Raise SceneError if there are too few frames for one of the `stages` of a scene."""
+    field_frames = range(0, frames, scene.tracers.field_every)
     if "train" in stages:
-        if training is not None and seen > 0:
-            trained_frames(training, frames, field_frames)
+        if scene.own_training is not None and seen > 0:
+            trained_frames(scene.own_training, frames, field_frames)
         between_frames(frames, field_frames)
     if "simulate" in stages:
-        rollout_start(simulation, tracers, seen, frames, field_frames)
+        rollout_start(scene.simulation, scene.tracers, seen, frames, field_frames)
 
 
 def last_seen(window: float, frames: int) -> int:

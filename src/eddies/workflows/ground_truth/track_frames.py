@@ -42,9 +42,9 @@ class MeasuredTracks:
     uniform : whether all tracks of a frame have the same velocity, in each frame.
     throughout : whether the track of a row is present in all frames, (rows,).
     spacing : mean particle spacing, the cube root of (volume with particles / mean number of rows of a frame).
-    unit : the scene's unit of length, in the unit of the file.
-    corner : position in the periodic cube of the origin of the file's coordinates, in the unit of the file.
-    about : the attributes of the product that describe the file and the tracks.
+    about : the attributes of the product that describe the file and the tracks. `length_unit` is the scene's unit of
+        length, in the unit of the file. `corner` is the position in the periodic cube of the origin of the file's
+        coordinates, in the unit of the file.
     """
 
     times: np.ndarray
@@ -53,8 +53,6 @@ class MeasuredTracks:
     uniform: bool
     throughout: np.ndarray
     spacing: float
-    unit: float
-    corner: np.ndarray
     about: Mapping[str, Any]
 
     @property
@@ -163,7 +161,7 @@ def _read_measured(settings: Settings, state: tuple[int, int] | None) -> Measure
     if uniform:
         log.warning("%s: all tracks move alike: the velocity field is uniform, and there are no errors relative to "
                     "its fluctuation", settings.file)
-    return MeasuredTracks(times, found.starts, columns, uniform, (counts == len(times))[place], spacing, unit, corner,
+    return MeasuredTracks(times, found.starts, columns, uniform, (counts == len(times))[place], spacing,
                           about | {"length_unit": unit, "corner": corner})
 
 

@@ -27,8 +27,8 @@ from eddies.scene.terms import Forcing
 from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.time_stepping import ETDRK4
+from eddies.workflows.ground_truth.flow_run import restored_rows, saved_rows
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.rollout.saved_particles import restored_rows, saved_rows
 
 # A flow is unstable if its energy is more than this factor times its initial energy.
 RUNAWAY_ENERGY = 100.0

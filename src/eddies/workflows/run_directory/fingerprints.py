@@ -17,13 +17,9 @@ from eddies.scene.sections import SET_KEYS
 from eddies.scene.values import import_paths
 
 
-# The keys that only set the duration of a stage. If nothing else differs, the stage can continue from a checkpoint.
-DURATION_KEYS = {"dns": ("tracers.turnovers", "time.duration")}
-
-
 def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> str:
     """Return the SHA-256 checksum of all inputs of a stage's product. `without` names keys to leave out, such as
-    DURATION_KEYS.
+    `Stage.duration`.
 
     The inputs are the settings of the stage and of the stages on which it depends, the content of the files from which
     the flow, the weights and the step come, the source code of the user's classes, and the fingerprints of ground
@@ -41,12 +37,10 @@ def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> 
         settings["tracers"] = {key: value for key, value in settings["tracers"].items() if key not in SET_KEYS} | {
             "sets": {name: {key: sets[name][key] for key in SET_KEYS} for name in sorted(sets)}}
     # The content of these files counts, not their paths.
-    if settings["start"] is not None:
-        del settings["tracks" if scene.tracks else "initial"]["path"]
-    if settings["weights"] is not None:
-        del settings["model"]["path"]
-    if settings["found_step"] is not None:
-        del settings["simulation"]["step_from"]
+    for content, section, key in (("start", "tracks" if scene.tracks else "initial", "path"),
+                                  ("weights", "model", "path"), ("found_step", "simulation", "step_from")):
+        if settings[content] is not None:
+            del settings[section][key]
     if simulation is not None:
         del settings["simulation"]["confirmed_on"]
     settings |= {f"own_{name}": origins(path for key, path in import_paths(scene) if key.startswith(f"{name}."))

@@ -10,7 +10,6 @@ import os
 import tomllib
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +28,7 @@ from eddies.scene.layers import dotted
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Scene, Simulation
 from eddies.scene.sections import CONVERGED
-from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, set_files, stage_fingerprint
+from eddies.workflows.run_directory.fingerprints import set_files, stage_fingerprint
 
 SECONDS = "stage_seconds.json"
 FAILURE = "failure.txt"  # the error of a failed variant
@@ -68,21 +67,12 @@ ACTIONS = {
 }
 
 
-@dataclass(frozen=True)
-class Work:
-    """The work that stages find in a run directory."""
+class Work(NamedTuple):
+    """The work that stages find in a run directory: the action of each stage by its name, and the files that the stages
+    would replace, each with its wall time or date."""
 
-    directory: Path
-    actions: Mapping[str, Action]  # by stage
-    lost: tuple[str, ...]  # the files that the stages would replace, each with its wall time or date
-    changes: tuple[str, ...]  # the settings that differ from those of the lost files
-
-    def refuse_to_lose(self) -> None:
-        """Raise WouldReplaceWork if anything would be replaced."""
-        if self.lost:
-            raise WouldReplaceWork(f"{self.directory}: holds work of {of_other_settings(self.changes)} that would "
-                                   f"be replaced: {', '.join(self.lost)}; add --overwrite to replace it, or choose "
-                                   "another --output")
+    actions: Mapping[str, Action]
+    lost: Sequence[str]
 
 
 def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Collection[str] = (),
@@ -100,10 +90,10 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, links: Colle
         lost |= of_stage
         for then in of_stage.values():
             changes |= dict.fromkeys(changed_settings(stage, then, scene.to_toml()))
-    work = Work(directory, actions, tuple(lost), tuple(changes))
-    if not overwrite:
-        work.refuse_to_lose()
-    return work
+    if lost and not overwrite:
+        raise WouldReplaceWork(f"{directory}: holds work of {of_other_settings([*changes])} that would be replaced: "
+                               f"{', '.join(lost)}; add --overwrite to replace it, or choose another --output")
+    return Work(actions, [*lost])
 
 
 def _work_of(stage: Stage, scene: Scene, directory: Path,
@@ -116,7 +106,7 @@ def _work_of(stage: Stage, scene: Scene, directory: Path,
     origin = product_provenance(directory / stage.file)
     checkpoints = checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
     fingerprints = [fingerprint for _, fingerprint in checkpoints]
-    continued = stage_fingerprint(scene, stage.name, DURATION_KEYS.get(stage.name, ()))
+    continued = stage_fingerprint(scene, stage.name, stage.duration)
     sets = _other_sets(scene, directory) if stage.name == "dns" else {}
     product = _product_state(stage, scene, directory / stage.file, origin, continued)
     if sets and product == "same":  # not all its parts are there

@@ -12,6 +12,7 @@ import torch
 
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.trajectories import Trajectory
+from eddies.parallel.stop import Stopped
 from eddies.particles.flow_units import resolved_wavenumber
 from eddies.particles.integrators import INTEGRATORS, RungeKutta
 from eddies.particles.resolved_velocity import ResolvedVelocity
@@ -20,9 +21,10 @@ from eddies.scene.scene import BOX_LENGTH, Model, SceneError, load_scene
 from eddies.scene.sections import METHODS
 from eddies.workflows import report, simulate, train
 from eddies.workflows.ground_truth.truth import open_truth
-from eddies.workflows.rollout.method import make_method
-from eddies.workflows.rollout.particle_run import SOLVES, ParticleRun
+from eddies.workflows.rollout.method import SOLVES, ParticleRun, make_method
+from tests.commands import first_rank
 from tests.workflows.small_rollout import OWN_METHOD, prepared, scales_of, scene_text, with_method
+from tests.workflows.stopping import StopAtStep
 
 pytestmark = pytest.mark.usefixtures("quick_spectra")
 
@@ -212,12 +214,14 @@ def test_terms_that_read_the_density_are_refused_in_an_incompressible_flow(tmp_p
 
 @pytest.mark.mpi(2)
 def test_a_method_of_the_users(comm, small_products, linked, own):
+    """It has no state, so a stopped rollout begins again."""
     directory = linked(small_products[1])
-    if comm.rank == 0:
-        own("own_method", OWN_METHOD)
-    comm.Barrier()
-    scene = replace(small_products[0], model=Model(preset="resolved"))
-    simulate.run(with_method(scene, "own_method:Swept"), comm, directory)
+    first_rank(comm, own, "own_method", OWN_METHOD)
+    scene = with_method(replace(small_products[0], model=Model(preset="resolved")), "own_method:Swept")
+    with pytest.raises(Stopped, match="after the last finished stage"):
+        simulate.run(scene, comm, directory, StopAtStep(comm, 1))
+    simulate.run(scene, comm, directory)
+    assert not (directory / "checkpoints-rollout").exists()
     attributes, tables, columns = read_rollout(comm, directory)
     assert attributes["method"] == "own_method:Swept" and attributes["terms"] == "wind" and "wind" in tables
     assert attributes["status"] == "complete" and len(columns["time"]) > 1 and "density" not in columns

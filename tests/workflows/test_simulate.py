@@ -1,17 +1,26 @@
-"""A rollout that is stopped and continued equals the one that was never stopped."""
+"""Rollouts: stopped and continued as if never stopped; their steps, frames and times."""
 
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
-from eddies.io.checkpoint import Checkpoint
+from eddies.clock import ProgressLine
+from eddies.io.checkpoint import Checkpoint, Guard
+from eddies.io.frame_segments import FrameSegments
+from eddies.io.hdf5 import create_product, open_product
+from eddies.io.trajectories import Trajectory
 from eddies.parallel.stop import Stopped
+from eddies.particles.particle_set import ParticleSet
 from eddies.scene.scene import BOX_LENGTH, Eulerian, Model
 from eddies.workflows import simulate
+from eddies.workflows.simulate import Course, frame_layout, quartiles
+from tests.commands import first_rank
 from tests.workflows.contents import assert_same, numbers_in
-from tests.workflows.small_rollout import OWN_METHOD, prepared, scales_of, with_method, write_model
+from tests.workflows.small_rollout import prepared, scales_of, with_method, write_model
 from tests.workflows.stopping import StopAtStep
 
 pytestmark = pytest.mark.usefixtures("quick_spectra", "quick_solves")
@@ -78,9 +87,7 @@ def check_splits(comm, scene, directory, monkeypatch, each=1):
     whole, saved, checkpoints = product(comm, directory), directory / "saved", directory / "checkpoints-rollout"
     steps, at_frames = int(whole["rollout/steps"]), sorted(set(whole["particles/model/position/step"].tolist()))
     assert whole["rollout/status"] == "complete" and len(at_frames) >= 2
-    if comm.rank == 0:
-        checkpoints.rename(saved)
-    comm.Barrier()
+    first_rank(comm, checkpoints.rename, saved)
     found = sorted(saved.glob("step-*"))
     assert len(found) == steps >= 3
     for split in sorted({0, 1, at_frames[1], steps - 1} - {steps})[each - 1::each]:
@@ -118,9 +125,7 @@ def test_a_stopped_rollout_continues_and_leaves_nothing_else(comm, small_product
     names = {path.name for path in directory.iterdir()}
     simulate.run(scene, comm, directory)
     whole = product(comm, directory)
-    if comm.rank == 0:
-        (directory / "rollout.h5").unlink()
-    comm.Barrier()
+    first_rank(comm, (directory / "rollout.h5").unlink)
     for number in (1, 2):
         with pytest.raises(Stopped, match=f"from step {number} of the rollout"):
             simulate.run(scene, comm, directory, StopAtStep(comm, 1))
@@ -158,19 +163,6 @@ def test_another_number_of_ranks_goes_on_to_rounding(comm, case_of, name, before
     comm.Barrier()
 
 
-@pytest.mark.mpi(1)
-def test_a_method_without_a_state_begins_again(comm, small_products, linked, own):
-    scene, folder = small_products
-    directory = linked(folder)
-    own("own_restarting", OWN_METHOD)
-    scene = with_method(scene, "own_restarting:Swept")
-    with pytest.raises(Stopped, match="after the last finished stage"):
-        simulate.run(scene, comm, directory, StopAtStep(comm, 1))
-    simulate.run(scene, comm, directory)
-    assert product(comm, directory)["rollout/status"] == "complete"
-    assert not (directory / "checkpoints-rollout").exists()
-
-
 @pytest.mark.mpi(3)
 def test_a_few_particles_go_on(comm, tmp_path, monkeypatch):
     """One rank has a single one of these eight particles."""
@@ -180,3 +172,119 @@ def test_a_few_particles_go_on(comm, tmp_path, monkeypatch):
                      removals=["kernel", "training.horizons"])
     states = check_splits(comm, scene, tmp_path, monkeypatch)
     assert states[0]["rows_of_ranks"].sum() == 8 and 1 in states[0]["rows_of_ranks"]
+
+
+class Standing:
+    """Particles at rest, in steps of 0.1."""
+
+    def __init__(self):
+        self.time = 0.0
+
+    def advance(self, until, number):
+        self.time += 0.1
+
+    def frame(self, time):
+        return SimpleNamespace(velocity=torch.zeros(1, 3), to_numpy=dict), torch.zeros(1, 3)
+
+    def status(self):
+        return ""
+
+    def state_dict(self):
+        return {"time": self.time}
+
+    def load_state_dict(self, saved):
+        self.time = saved["time"]
+
+
+class Still(Course):
+    """Records times and steps of the frames."""
+
+    def _store(self, at):
+        self.times.append(at)
+        self.stored = [*getattr(self, "stored", []), self.steps]
+
+
+def course_of(comm, directory, looks=10**9, method=Standing, count=4, interval=0.25):
+    guard = Guard(comm, directory, "settings", StopAtStep(comm, looks))
+    segments = SimpleNamespace(comm=comm, names=[], close=lambda: None)
+    return Still(method(), segments, count, interval, guard, guard.checkpoints.newest())
+
+
+@pytest.mark.mpi(1)
+def test_each_part_of_a_run_has_a_warm_up_that_is_not_timed(comm, tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr(ProgressLine, "__call__", lambda self, done, step: shown.append(step))
+    whole = course_of(comm, tmp_path / "whole")
+    outcome = whole.run()
+    assert outcome["status"] == "complete" and outcome["steps"] == 10 and len(whole.seconds) == 8
+    assert whole.times == [0, 0.25, 0.5, 0.75, 1] and whole.stored == [0, 3, 5, 8, 10]
+    assert shown == [*range(1, 11)]  # also after steps between frames
+    first = course_of(comm, tmp_path / "parts", 5)
+    with pytest.raises(Stopped, match="from step 5"):
+        first.run()
+    second = course_of(comm, tmp_path / "parts")
+    assert second.progress.done == pytest.approx(0.5) and second.seconds == first.seconds and len(first.seconds) == 3
+    assert second.run()["steps"] == 10 and len(second.seconds) == 3 + 3
+    assert second.times == whole.times and second.stored == [8, 10]
+
+
+class Falling(Standing):
+    """Particles whose first step fails."""
+
+    def advance(self, until, number):
+        return "fell"
+
+
+@pytest.mark.mpi(2)
+def test_times_are_those_of_timed_steps_on_the_same_ranks(comm, tmp_path):
+    """The first two steps are a warm-up. A step that fails has neither a time nor a length."""
+    alone, place = comm.Split(comm.rank), tmp_path / f"rank-{comm.rank}"
+    timed = {"seconds_per_step", "seconds_per_step_low", "seconds_per_step_high"}
+    found = [course_of(alone, place, count=1, interval=interval).run() for interval in (0.25, 0.2)]
+    assert [outcome["steps"] for outcome in found] == [3, 2]
+    assert timed < found[0].keys() and not timed & found[1].keys() and found[1]["time_step"] == pytest.approx(0.1)
+    assert quartiles([1.0, 2.0, 3.0, 4.0, 5.0]) == dict(zip(sorted(timed), (3.0, 4.0, 2.0)))
+    fallen = course_of(alone, place, method=Falling).run()
+    assert fallen == {"status": "stopped: fell", "time": 0.0, "steps": 0}
+    with pytest.raises(Stopped):
+        course_of(comm, tmp_path / "run", 5).run()
+    if comm.rank == 0:
+        course = course_of(alone, tmp_path / "run")
+        assert course.steps == 5 and course.seconds == []
+    comm.Barrier()
+
+
+class Carried(Standing):
+    """Particles in reverse order, not on the ranks of their slabs, some outside the box."""
+
+    def __init__(self, comm, total, density):
+        super().__init__()
+        ids = np.arange(total)[::-1]
+        own = ids[ids % comm.size == comm.rank]
+        self.columns = {"id": own, "position": own[:, None] + np.array([0.5, 7.0, -1.0]),
+                        "velocity": own[:, None] * np.ones(3)} | ({"density": 2.0 + own} if density else {})
+
+    def frame(self, time):
+        return ParticleSet.from_numpy(self.columns), torch.full((len(self.columns["id"]), 3), time)
+
+
+@pytest.mark.mpi(1, 3)
+def test_a_frame_holds_the_particles_of_the_method_in_order_of_id(comm, tmp_path):
+    total, length, density = 7, 2 * np.pi, comm.size == 3
+    guard = Guard(comm, tmp_path / "checkpoints", "settings", StopAtStep(comm, 10**9))
+    with FrameSegments(comm, tmp_path / "checkpoints", frame_layout(total, length, density)) as segments:
+        course = Course(Carried(comm, total, density), segments, 2, 0.1, guard, None)
+        course.run()
+        with create_product(comm, tmp_path / "rollout.h5", "rollout", {}) as file:
+            segments.assemble(file)
+    assert course.energy == pytest.approx(1.5 * np.var(np.arange(total)))  # without the mean
+    with open_product(comm, tmp_path / "rollout.h5", "rollout") as file:
+        assert list(file["particles"]) == ["model"] and "fields" not in file
+        stored, ids = Trajectory(file, "model"), np.arange(total)
+        assert set(stored.columns) == {"position", "image", "velocity", "acceleration"} | (
+            {"density"} if density else set())
+        assert stored.times == pytest.approx([0, 0.1, 0.2])
+        assert stored.read(0, "position") == pytest.approx((ids[:, None] + [0.5, 7.0, -1.0]) % length, abs=1e-6)
+        assert np.array_equal(stored.read(2, "velocity"), ids[:, None] * np.ones(3))
+        assert stored.read(2, "acceleration") == pytest.approx(np.full((total, 3), 0.2))
+        assert not density or stored.read(1, "density").tolist() == (2.0 + ids).tolist()

@@ -11,20 +11,20 @@ from mpi4py import MPI
 
 from eddies.io.provenance import product_attributes, product_provenance
 from eddies.io.weights import load_weights
-from eddies.particles.exchanges import relative_error
 from eddies.parallel.reduction import global_sum
+from eddies.particles.exchanges import relative_error
 from eddies.particles.flow_units import planes_for
 from eddies.particles.model import FORCING
 from eddies.scene.scene import load_scene
 from eddies.workflows import dns, train
+from eddies.workflows.estimates import most_ranks
 from eddies.workflows.ground_truth.frame_counts import last_seen, rollout_start
 from eddies.workflows.learned.source import ModelDefinition
-from eddies.workflows.learned.training_data import load_frame, model_for, training_data
-from eddies.workflows.learned.truths import open_truths, truth_problems
+from eddies.workflows.learned.training_data import load_frame, model_for, open_truths, training_data, truth_problems
 from eddies.workflows.problems import problems, rank_problems
-from eddies.workflows.resources import most_ranks
-from eddies.workflows.variants import steps
 from eddies.workflows.rollout.method import forcing_of, make_method
+from eddies.workflows.variants import steps
+from tests.commands import first_rank
 from tests.changed_product import changed
 from tests.workflows.small_rollout import with_method
 
@@ -72,9 +72,7 @@ def scene_of(directory, *overrides):
 
 def made(comm, directory, *overrides, runs=("own",)):
     """A scene, and ground truths in run directories below `directory`, each with its own seed."""
-    if comm.rank == 0:
-        (directory / "own.toml").write_text(SCENE)
-    comm.Barrier()
+    first_rank(comm, (directory / "own.toml").write_text, SCENE)
     for seed, name in enumerate(runs, 1):
         (directory / name).mkdir(exist_ok=True)
         dns.run(scene_of(directory, *overrides, f"seed={seed}"), comm, directory / name)
