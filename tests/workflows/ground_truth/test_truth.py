@@ -66,7 +66,7 @@ def test_columns_and_scales_are_those_that_are_stored(comm, tmp_path, density):
     assert comm.allreduce(len(ids)) == stored["velocity"].shape[1]
     for name in names:
         assert np.array_equal(particles[name], stored[name][1][ids])
-        assert np.array_equal(window[f"{name}_later"], np.stack([stored[name][2][ids], stored[name][3][ids]], axis=1))
+        assert np.array_equal(window[f"{name}_later"], stored[name][2:4, window["id"]].swapaxes(0, 1))
     for name, rate in {"velocity": "acceleration", "density": "density_rate"}.items():
         if name in names:
             change = (stored[name][2] - stored[name][0]) / (times[2] - times[0])
