@@ -62,7 +62,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_log_options(measure)
     report = add_command(commands, "report", STAGES["report"].about)
     add_run(report, "run")
-    add_variants(report, "show this variant in the figures; repeatable, up to six (default: the first six that were run)")
+    add_variants(report, "show this variant in the figures; repeatable, up to six (default: the first six)")
     add_log_options(report)
     report.add_argument("--output", type=directory, metavar="DIR",
                         help="write the page there instead of RUN/report, for example if RUN is read-only")

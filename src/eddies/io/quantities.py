@@ -14,7 +14,7 @@ import numpy as np
 
 # The origin of the times in a product, by kind.
 BEGINNING = {"ground_truth": "since the release of the tracers", "reconstruction": "since the first frame",
-             "rollout": "since the start of the rollout"}
+             "rollout": "since the start of the rollout", "measures": "since the start of the rollout"}
 # Attributes of a file with a flow.
 CONVENTIONS = {
     "units": "L: edge of the cube over 2 pi; T: follows from lengths and velocities; M: so that the mean density is "
@@ -119,6 +119,35 @@ QUANTITIES = {
     "trials/*": Quantity("1", ROW, "{name} of the velocity: rms, divided by the rms of the true velocity"),
     "weights/*": Quantity("1", "", "trained parameters"),
 }
+# Quantities in measures.h5, likewise.
+OF_MEASURES = {
+    "paths_*/times": Quantity("T", "time", "since the first common frame"),
+    "paths_*/lags": Quantity("T", "lag", "interval of time"),
+    "paths_*/structure": Quantity("L^2/T^2", "lag", "mean square of the increments of a velocity component"),
+    "paths_*/flatness": Quantity("1", "lag", "flatness of the increments of a velocity component"),
+    "paths_*/acceleration_correlation": Quantity("1", "lag", "autocorrelation of the acceleration"),
+    "paths_*/acceleration_variance": Quantity("L^2/T^4", "time", "variance of an acceleration component"),
+    "paths_*/tetrad_shape": Quantity("1", "time eigenvalue", "eigenvalues of the moments of tetrads over their sum"),
+    "paths_*/*": Quantity("1", "time", "{name}, see eddies.analysis.lagrangian"),
+    "*/wavenumber": Quantity("1/L", "wavenumber", "shell of the modes whose |k| rounds to this number"),
+    "forced_spectra/*": Quantity("L^2/T^2", "wavenumber", "mean spectrum of the {name}"),
+    "*spectra/[!t]*": Quantity("L^2/T^2", "time wavenumber", "energy of each shell: {name}"),
+    "spectra/truth": Quantity("L^2/T^2", "time wavenumber", "energy of each shell: {name}"),
+    "planes/velocity_*": Quantity("L/T", "time component y x", "{name} in the plane z = pi"),
+    "planes/vorticity_*": Quantity("1/T", "time y x", "magnitude in the plane z = pi: {name}"),
+    "pdfs/*_kl": Quantity("1", "time", "KL divergence of the PDF of the {name}"),
+    "pdfs/*_[mt][or]*": Quantity("1", "time bin", "share of the values in each bin: {name}"),
+    "errors/[!t]*": Quantity("1", "time", "{name}, see eddies.analysis.against_truth"),
+    "*/energy": Quantity("L^2/T^2", "time", "kinetic energy per mass of the particles"),
+    "*/density_rms": Quantity("M/L^3", "time", "standard deviation of the density"),
+    "*/count_variance": Quantity("1", "time", "variance of counts in cells over that of random points"),
+    "invariant*/second": Quantity("1", "edge", "edges of the bins of Q / <Q_w>"),
+    "invariant*/third": Quantity("1", "edge", "edges of the bins of R / <Q_w>^(3/2)"),
+    "invariants/*": Quantity("1", "second third", "share of the particles in each bin: {name}"),
+    "invariant_rates/*": Quantity("1", "second third", "sum over the particles in each bin: {name}"),
+    "distances/*": Quantity("1", "bin", "share of the distances to the nearest particle in each bin: {name}"),
+    "forced_accelerations/*": Quantity("1", "bin", "share of the accelerations in each bin: {name}"),
+}
 
 
 def conventions(kind: str) -> dict[str, str]:
@@ -142,7 +171,8 @@ def dataset_attributes(kind: str, path: str) -> dict[str, str]:
     """Return `units`, `axes` and `description` of the dataset at `path` in a product of this `kind`; empty if the path
     is unknown."""
     group, _, name = path.rpartition("/")
-    quantity = next((each for pattern, each in QUANTITIES.items() if fnmatchcase(path, pattern)), None)
+    known = OF_MEASURES if kind == "measures" else QUANTITIES
+    quantity = next((each for pattern, each in known.items() if fnmatchcase(path, pattern)), None)
     if quantity is None and name == "time":
         beginning = "since the start of the simulation" if group == "fields/final" else BEGINNING.get(kind, "")
         quantity = Quantity("T", "time", beginning)

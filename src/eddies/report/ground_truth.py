@@ -67,8 +67,7 @@ def section(statistics: Table, spectra: Table, reference: Mapping[str, float], p
     shown = Section(
         "ground_truth", "Ground truth", f"{source} Numbers {when}, t = {at['time']:.3g}.",
         metrics=[Metric(key, label, at.get(key), reasons.get(key, ""))
-                 for key, label in METRICS.items() if key in at or key == "mach_turbulent"],
-        main=("reynolds_lambda", "kmax_eta", "mach_turbulent"))
+                 for key, label in METRICS.items() if key in at or key == "mach_turbulent"])
     shown.add_figure(
         "statistics", "History of the simulation", lambda: statistics_history(statistics, released),
         f"From t = {times[0]:.3g} to {times[-1]:.3g}. Energy {when}: {at['energy']:.3g}; dissipation rate: "

@@ -58,8 +58,7 @@ class Illustration:
 class Section:
     """A section of the page.
 
-    notices: sentences in coloured boxes. main: keys of the metrics that are shown beside the title. folded: whether
-    the section shows only its title and its main metrics until it is opened.
+    notices: sentences in coloured boxes. folded: whether the section shows only its title until it is opened.
     """
 
     key: str
@@ -68,7 +67,6 @@ class Section:
     notices: list[str] = field(default_factory=list)
     illustrations: list[Illustration] = field(default_factory=list)
     metrics: list[Metric] = field(default_factory=list)
-    main: Sequence[str] = ()
     folded: bool = False
 
     def add_figure(self, name: str, title: str, make: Callable[[], Any], caption: str) -> None:
@@ -79,11 +77,6 @@ class Section:
     def numbers(self) -> dict[str, Number]:
         """The values of the metrics by key, for metrics.json."""
         return {metric.key: metric.value for metric in self.metrics}
-
-    @property
-    def tiles(self) -> list[Metric]:
-        """The main metrics that have a value."""
-        return [metric for metric in self.metrics if metric.key in self.main and metric.value is not None]
 
     @property
     def columns(self) -> list[str]:

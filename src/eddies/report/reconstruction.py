@@ -38,8 +38,7 @@ def section(about: Mapping[str, float | str], errors: Mapping[str, np.ndarray], 
     if about["holdout"]:
         text += (f" A second reconstruction leaves out {about['holdout']:.0%} of the tracks. Its error at these tracks "
                  "estimates the error of the field.")
-    shown = Section("reconstruction", "Reconstruction", text, metrics=metrics,
-                    main=("validation_error", "velocity_error", "gradient_error"))
+    shown = Section("reconstruction", "Reconstruction", text, metrics=metrics)
     shown.add_figure("reconstruction", "Reconstructed fields", lambda: overview(both, plane),
                      "Normalised L2 errors over time" + (", and u_x in the plane z = π of the last frame." if plane
                                                          is not None else "."))
