@@ -14,6 +14,7 @@ import pytest
 import torch
 
 import eddies
+from eddies.workflows.diff import numbers_of
 
 CHECKOUT = Path(__file__).parents[1]
 EXAMPLES = CHECKOUT / "docs" / "examples"

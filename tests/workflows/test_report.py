@@ -381,7 +381,7 @@ def test_a_rollout_of_other_settings_is_left_out_of_the_comparison(comm, tmp_pat
     assert page.index("<th>free</th>") < page.index("<th>plain</th>")
     report.run(tmp_path, comm, ["plain"])
     assert "<th>free</th>" not in written(tmp_path)[1] and "1 more variants are in metrics.json" in written(tmp_path)[1]
-    with pytest.raises(SceneError, match="no such variant"):
+    with pytest.raises(SceneError, match="there is no variant \"other\""):
         report.run(tmp_path, comm, ["other"])
     assert any(line.strip().startswith("plain: simulate") and words in line for line in status_lines(tmp_path))
 

@@ -65,10 +65,15 @@ def of_model(run: Rollout) -> dict[str, Any]:
         solves = run.closure
         count = solves["solves"][1:].sum()
         found |= {"closure_iterations": float(solves["iterations"][1:].sum() / count) if count else None,
-                  "closure_most_iterations": int(solves["most_iterations"].max()),
+                  "closure_most_iterations": _integer(solves["most_iterations"].max()),
                   "closure_residual": float(solves["residual"].max()),
-                  "closure_not_converged": int(solves["not_converged"].sum())}
+                  "closure_not_converged": _integer(solves["not_converged"].sum())}
     return found
+
+
+def _integer(value: float) -> int | None:
+    """Return an integer, or None for a value that is not finite, as in a damaged table."""
+    return int(value) if np.isfinite(value) else None
 
 
 def series(run: Rollout, of: str) -> dict[str, np.ndarray]:

@@ -154,8 +154,8 @@ def with_same_truth(variants: Variants) -> Variants:
 def metrics_of(numbers: Mapping[str, Any], labels: Mapping[str, str], reason: str) -> list[Metric]:
     """Return the metrics of numbers in the order of `labels`. `reason` says why a number is missing; "" if REASONS
     do."""
-    return [Metric(key, label, numbers[key], reason or REASONS.get(key, "")) for key, label in labels.items()
-            if key in numbers]
+    return [Metric(key, label, numbers[key], reason if reason and key != "seconds_per_step" else REASONS.get(key, ""))
+            for key, label in labels.items() if key in numbers]
 
 
 def _notices(found: Mapping[str, Any]) -> Iterator[str]:
