@@ -23,7 +23,6 @@ METHODS = {
 WITHOUT_KERNEL = "it needs velocity gradients from the smoothing kernel, and there is no kernel.h5"
 SAMPLES = "between two samples of the truth of equal size"
 LABELS = {
-    **{key: words for key, words in MEASURES.items() if not key.endswith("_floor")},
     "method": "what moved the particles", "integrator": "integrator", "status": "status",
     "stable": "stable to the end", "turnovers": "eddy turnovers of the rollout",
     "two_flows": "model and truth are forced differently", "broken": "model is not finite from (T)",
@@ -51,6 +50,8 @@ LABELS = {
     "band_energy_ratios": "energy of bands of wavenumbers, model / filtered flow",
     "band_energy_ratios_floor": "the same ratios for the true tracers",
     "nearest_distance_kl": "KL divergence of the nearest-neighbour distance PDF",
+    **{key: words for key, words in MEASURES.items() if key.endswith(("_drift", "count_variance")) or "structure" in key
+       or "flatness" in key or key.startswith(("acceleration_c", "acceleration_v", "pair", "tetrad"))},
     "seconds_per_step": "seconds of a step (median, without storing)", "particles": "particles", "ranks": "ranks",
     "storing_share": "share of the wall time that storing took",
     "evaluations_per_turnover": "evaluations of the forces per turnover",
@@ -133,7 +134,11 @@ def section(variants: Variants, numbers: Mapping[str, Mapping[str, Any]], others
     if others:
         text += f" {others} more variants are in metrics.json; `--variant` chooses those that are shown."
     found = Section("rollouts", "Rollouts against the truth", text, folded=True)
-    found.notices = [f"{each.label}: {notice}" for each in variants.values() for notice in _notices(each.numbers)]
+    notices: dict[str, list[str]] = {}
+    for each in variants.values():
+        for notice in _notices(each.numbers):
+            notices.setdefault(notice, []).append(each.label)
+    found.notices = [f"{', '.join(labels)}: {notice}" for notice, labels in notices.items()]
     found.metrics = side_by_side({each.label: metrics_of(numbers[name], LABELS, each.numbers["not_compared"])
                                   for name, each in variants.items()})
     words = next((each.numbers["reconstructed_by"] for each in variants.values()), "")
