@@ -24,7 +24,7 @@ from eddies.clock import duration
 from eddies.cores import check_threads, default_to_one_thread
 from eddies.errors import UserError
 from eddies.logs import OUTCOME, configure_logging, show_warnings
-from eddies.pipeline import STAGES
+from eddies.pipeline import MEASURED, STAGES
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 
 if TYPE_CHECKING:
@@ -200,6 +200,14 @@ def report_command(options: argparse.Namespace, comm: Comm) -> None:
         webbrowser.open(page.resolve().as_uri())
 
 
+def measure_command(options: argparse.Namespace, comm: Comm) -> None:
+    """Measure the rollout of a run directory, or the rollouts of its variants."""
+    from eddies.workflows import measure
+    for where in measure.rollouts_in(options.run, comm):
+        measure.run(where, comm)
+        log.log(OUTCOME, "measure: %s", where / MEASURED)
+
+
 def export_command(options: argparse.Namespace, comm: Comm) -> None:
     """Write the fields and particles of a run directory in another format."""
     from eddies.stored_run import variant_directory
@@ -237,17 +245,14 @@ def status_command(options: argparse.Namespace, comm: Comm) -> None:
 
 
 def diff_command(options: argparse.Namespace, comm: Comm) -> None:
-    """Print the differences between two runs, or between runs of variants."""
-    from eddies.stored_run import variant_directory
-    runs = [run for run in (options.one, options.other) if run is not None]
-    names = options.variants
-    if names:
-        runs = [variant_directory(run, name) for run in runs for name in names]
+    """Print the differences between two runs, or between variants."""
+    runs = [(run, name) for run in (options.one, options.other) if run is not None
+            for name in options.variants or [None]]
     if len(runs) != 2:
         raise OptionError("diff: give two runs, or one run and --variant twice, or two runs and --variant once")
     import_module("eddies.workflows.diff").run(*runs, comm)
 
 
 # All others are stages, or `run`.
-COMMANDS = {"report": report_command, "export": export_command, "check": check_command, "scenes": scenes_command,
-            "status": status_command, "diff": diff_command}
+COMMANDS = {"measure": measure_command, "report": report_command, "export": export_command, "check": check_command,
+            "scenes": scenes_command, "status": status_command, "diff": diff_command}

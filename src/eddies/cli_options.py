@@ -21,6 +21,7 @@ EXAMPLES = {
     "train": ("eddies train hit-small", "eddies train hit-mt016 --set model.path=runs/hit"),
     "find-step": ("eddies find-step hit-small --set simulation.integrator=verlet",),
     "simulate": ("eddies simulate hit-small --overwrite --set simulation.method=none",),
+    "measure": ("eddies measure runs/hit-small",),
     "report": ("eddies report runs/hit-small --open",),
     "export": ("eddies export runs/tiny --format vtkhdf", "eddies export runs/hit --format lagrangebench"),
     "check": ("eddies check hit", "eddies check mine.toml --set flow.cells=256 --unset forcing --json"),
@@ -54,10 +55,13 @@ def build_parser() -> argparse.ArgumentParser:
         if name in ("run", "train", "find-step", "simulate"):
             add_variants(command, "run only this variant of the scene; repeatable")
         add_job_options(command, "run directory (default: runs/NAME)")
+    measure = add_command(commands, "measure", "numbers and small arrays of each rollout of a run directory; "
+                          "simulate does the same")
+    add_run(measure, "run")
+    add_log_options(measure)
     report = add_command(commands, "report", STAGES["report"].about)
     add_run(report, "run")
-    add_variants(report, "show this variant after the table of all variants; if given several times, the first one "
-                         "that was run")
+    add_variants(report, "show this variant in the figures; repeatable, up to six (default: the first six)")
     add_log_options(report)
     report.add_argument("--output", type=directory, metavar="DIR",
                         help="write the page there instead of RUN/report, for example if RUN is read-only")

@@ -164,7 +164,7 @@ class StoredRun:
         from mpi4py import MPI
 
         from eddies.workflows.report import sections_of
-        return {drawing.name: drawing.figure for section in sections_of(self.path, MPI.COMM_SELF)
+        return {drawing.name: drawing.make() for section in sections_of(self.path, MPI.COMM_SELF)
                 for drawing in section.illustrations}
 
     def __repr__(self) -> str:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from eddies.report.figures import DNS, FOURTH, MODEL, SECOND, THIRD, TRUTH, letter, number_wavenumbers, panels, styled
+from eddies.report.figures import BLUE, DNS, FOURTH, MODEL, SECOND, THIRD, letter, number_wavenumbers, panels, styled
 from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.stored_run import open_run
 
@@ -58,7 +58,7 @@ def draw(found: dict[str, dict[int, np.ndarray]], grids: set[str], shells: np.nd
     count = len(found) - len(grids)
     colours = dict(zip(order, [*COLOURS[:count], *COLOURS[:len(grids)]]))
     for axis, station in zip(axes.flat, ENERGY):
-        axis.loglog(shells, filtered_experiment(station, shells, filter_width), "o", color=TRUTH, label="experiment")
+        axis.loglog(shells, filtered_experiment(station, shells, filter_width), "o", color=BLUE, label="experiment")
         for name in order:
             axis.loglog(shells, found[name][station].mean(0), "--" if name in grids else "-", color=colours[name],
                         label=name)

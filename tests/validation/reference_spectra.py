@@ -15,7 +15,7 @@ from mpi4py import MPI
 
 from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.io.hdf5 import open_product
-from eddies.workflows.report import read_stationary_span
+from eddies.workflows.ground_truth.stationary import read_stationary_span
 
 # Johns Hopkins Turbulence Databases, isotropic1024coarse, Re_lambda 417 to 433 (Li et al., J. Turbulence 9, N31, 2008;
 # Perlman et al. 2007): k eta and the compensated spectrum, with nu = 1.85e-4, eps = 0.1031 and eta = 0.0028.

@@ -21,14 +21,14 @@ from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import advective_speed
 from eddies.flow.stability import IMAGINARY_REACH, REAL_REACH, FlowDiverged, StabilityWatch, step_limits
 from eddies.parallel.reduction import global_max
-from eddies.report.figures import GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled
+from eddies.report.figures import BLUE, GUIDE, MODEL, SECOND, THIRD, letter, panels, styled
 from eddies.time_stepping import STEPPERS
 
 TURBULENT_STEPS = 60
 HIGHEST = 8.0  # of the advective numbers that are tried
 ANY, PERCENT = 1e-6, 1e-2  # growths a step: as good as none; one that a little viscosity stops
 NAMES = {"etdrk4": "ETDRK4", "rk4": "RK4"}
-COLOURS = {("etdrk4", ANY): TRUTH, ("etdrk4", PERCENT): SECOND, ("rk4", ANY): MODEL}
+COLOURS = {("etdrk4", ANY): BLUE, ("etdrk4", PERCENT): SECOND, ("rk4", ANY): MODEL}
 
 
 def theoretical_boundary(stepper, growth, viscosity=0.0, sound=0.0):
@@ -128,7 +128,7 @@ def growth_panel(axis, rows):
     for factor in (amplification("rk4", 0 * number, number), amplification("rk4", -number, 0 * number)):
         axis.plot(number, np.abs(factor), color=GUIDE)
     for (stepper, limit), marker, colour in zip([("etdrk4", "advection"), ("rk4", "advection"), ("rk4", "sound"),
-                                                 ("rk4", "viscosity")], "os^v", (TRUTH, MODEL, THIRD, SECOND)):
+                                                 ("rk4", "viscosity")], "os^v", (BLUE, MODEL, THIRD, SECOND)):
         own = [row for row in rows if (row["stepper"], row["limit"]) == (stepper, limit)]
         axis.plot([row["number"] for row in own], [row["measured"] for row in own], marker, markersize=4,
                   color=colour, label=f"{NAMES[stepper]}, {limit}")
@@ -156,7 +156,7 @@ def boundary_panel(axis, rows, stiffness, values, limits):
 
 def turbulence_panel(axis, rows):
     """Longest step of turbulence against the Mach number."""
-    for stepper, colour in (("etdrk4", TRUTH), ("rk4", MODEL)):
+    for stepper, colour in (("etdrk4", BLUE), ("rk4", MODEL)):
         own = [row for row in rows if row["stepper"] == stepper]
         mach = [row["mach_turbulent"] for row in own]
         axis.loglog(mach, [row["theory"] for row in own], color=colour, linewidth=1.2)

@@ -20,7 +20,7 @@ from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid, ad
 from eddies.flow.stability import IMAGINARY_REACH
 from eddies.flow.statistics import energy_spectrum, gradient_moments
 from eddies.parallel.reduction import global_max
-from eddies.report.figures import MODEL, TRUTH, letter, panels, styled
+from eddies.report.figures import BLUE, MODEL, letter, panels, styled
 from eddies.time_stepping import ETDRK4, STEPPERS
 
 MACH_NUMBERS, DURATION, SKEWNESS = (0.04, 0.08, 0.16), 0.5, -0.4  # the start has developed at this skewness
@@ -96,7 +96,7 @@ def draw(found, path):
     figure, axes = panels(1, len(found), (3.25, 3.2), sharex=True, sharey=True)
     figure.set_layout_engine("constrained")  # for labels and legends that are wide
     for (mach, runs), axis in zip(found.items(), axes.flat):
-        for stepper, colour, marker in (("etdrk4", TRUTH, "o"), ("rk4", MODEL, "s")):
+        for stepper, colour, marker in (("etdrk4", BLUE, "o"), ("rk4", MODEL, "s")):
             stable = [run for run in runs[:-1] if run["stepper"] == stepper and "density" in run]
             for quantity, style in (("density", "-"), ("spectrum", "--")):
                 axis.loglog([run["seconds"] for run in stable], [run[quantity] for run in stable], style, color=colour,

@@ -16,15 +16,15 @@ from mpi4py import MPI
 
 from eddies.analysis.isotropic_turbulence import Row, comparison
 from eddies.io.hdf5 import open_product
-from eddies.report.figures import DNS, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled
+from eddies.report.figures import BLUE, DNS, GUIDE, MODEL, SECOND, THIRD, letter, panels, styled
 from eddies.report.page import shown
 from eddies.report.stationary import draw_compensated
-from eddies.workflows.report import read_stationary_span
+from eddies.workflows.ground_truth.stationary import read_stationary_span
 
 NOMINAL = (0.04, 0.08, 0.16)  # turbulent Mach numbers of the paper's Table 1
 MEASURED, STEPS = 0.05, 0.1  # how far M_t and the steps per turnover may be off
-COLOURS = (TRUTH, MODEL, SECOND, THIRD, DNS)
-SCALED = {"density_rms": (r"$\rho_{rms}/\rho_0$", TRUTH, "o"), "compressible_velocity": (r"$\sqrt{\chi}$", MODEL, "s")}
+COLOURS = (BLUE, MODEL, SECOND, THIRD, DNS)
+SCALED = {"density_rms": (r"$\rho_{rms}/\rho_0$", BLUE, "o"), "compressible_velocity": (r"$\sqrt{\chi}$", MODEL, "s")}
 
 
 class Run:
@@ -90,7 +90,7 @@ def draw(runs: list[Run]) -> Figure:
         measured.axhline(limit, color=GUIDE, linestyle=":", linewidth=1)
     deviations = [run.rows["mach_turbulent"].deviation / run.nominal for run in runs]
     measured.errorbar([run.nominal for run in runs], [run.mach / run.nominal for run in runs], deviations, fmt="o",
-                      color=TRUTH, capsize=3)
+                      color=BLUE, capsize=3)
     measured.set(title="Turbulent Mach number", xlabel="nominal $M_t$", ylabel="measured / nominal", xscale="log")
     measured.margins(y=0.3)
     reach = np.array([mach.min() / 1.2, mach.max() * 1.2])
@@ -105,7 +105,7 @@ def draw(runs: list[Run]) -> Figure:
     counts = np.array([run.span.steps_per_turnover for run in runs])
     for limit in (1 - STEPS / 2, 1 + STEPS / 2):
         steps.axhline(limit * counts.mean(), color=GUIDE, linestyle=":", linewidth=1)
-    steps.plot(mach, counts, "o", color=TRUTH)
+    steps.plot(mach, counts, "o", color=BLUE)
     steps.set(title="Cost", xlabel="$M_t$", ylabel="steps per turnover", xscale="log",
               ylim=(0, 1.3 * counts.max()))
     for axis in (measured, scaled, steps):

@@ -229,12 +229,9 @@ class Rollout:
         """Return the indices of the common frames at whose times the spectrum of the flow is stored."""
         return np.flatnonzero(self._has_flow(self.common.times))
 
-    def shown_spectra(self, several: bool = True) -> np.ndarray:
-        """Return at most SHOWN of the indices that `spectral` returns, evenly spread.
-
-        If `several` is false, return only the last one.
-        """
-        return _spread(self.spectral(), SHOWN) if several else self.spectral()[-1:]
+    def shown_spectra(self) -> np.ndarray:
+        """Return at most SHOWN of the indices that `spectral` returns, evenly spread."""
+        return _spread(self.spectral(), SHOWN)
 
     def late_spectra(self) -> np.ndarray:
         """Return the frame numbers over which the spectrum of the model is averaged.

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import functools
 import io
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 from matplotlib.transforms import Bbox
 
-from eddies.analysis.pdfs import bin_centres, gaussian, pdf, standardized
+Look = tuple[str, str]  # colour, marker
 
 # The palette of Okabe and Ito, which colour-blind readers can distinguish. A quantity has one colour in all figures.
-DNS, FILTERED, TRUTH, MODEL = "#000000", "#7f7f7f", "#0072B2", "#D55E00"
-SECOND, THIRD, FOURTH = "#009E73", "#CC79A7", "#E69F00"
+DNS, FILTERED, TRUTH, MODEL = "#000000", "#7f7f7f", "#000000", "#D55E00"
+BLUE, SECOND, THIRD, FOURTH, FIFTH, SIXTH = "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8c564b"
 GUIDE, NOTE = "#9a9a9a", "#5a5a5a"
 SIGNED, POSITIVE = "RdBu_r", "viridis"
 LEFT, RIGHT, BOTTOM, TOP = 0.84, 0.12, 0.5, 0.3  # inches around a panel, for its labels and its title
@@ -33,8 +35,13 @@ STYLE = {
     "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.8, "lines.linewidth": 1.7,
     "axes.formatter.limits": (-4, 4),  # wider tick labels get a common factor
     "legend.frameon": False, "figure.dpi": 150, "savefig.dpi": 150, "axes.prop_cycle": matplotlib.cycler(
-        color=[TRUTH, MODEL, SECOND, THIRD, FOURTH, DNS]),
+        color=[BLUE, MODEL, SECOND, THIRD, FOURTH, DNS]),
 }
+# Colour and marker of each method in all figures, by the name of its preset; "none": without any force.
+LOOKS = {"paper": (MODEL, "o"), "resolved": (SECOND, "s"), "local": (THIRD, "D"), "paper-code": (SIXTH, "v"),
+         "wcsph": (FOURTH, "^"), "transport-velocity": (FIFTH, "P"), "none": ("#b5a642", "X")}
+OTHERS = list(zip(("#7b3294", "#e7298a", "#66a61e", "#a6761d", "#1b9e77", "#666633"), ">p<d*8"))  # of other methods
+GRID, LIGHTEST = "h", 0.55  # marker of grids; share of white in the blue of the coarsest grid
 # The backend is left out: rc_context does not restore it, and a notebook would no longer show its figures.
 PLAIN = {key: value for key, value in matplotlib.rcParamsDefault.items() if key != "backend"}
 
@@ -76,7 +83,7 @@ def panels(rows: int, columns: int, size: tuple[float, float], right: float = 0.
 
 def legend_at_foot(figure: Figure, axis: Axes, columns: int) -> None:
     """Put the legend of a panel at the foot of the figure, where the argument `foot` of `panels` has left room."""
-    figure.legend(*axis.get_legend_handles_labels(), loc="lower center", ncols=columns)
+    figure.legend(*axis.get_legend_handles_labels(), loc="lower center", ncols=columns, columnspacing=1.2)
 
 
 def letter(axes: Sequence[Axes]) -> None:
@@ -122,20 +129,22 @@ def largest(*arrays: np.ndarray) -> float:
     return float(np.quantile(values, 0.998)) or 1.0
 
 
-def draw_pdfs(axis: Axes, truth: np.ndarray, model: np.ndarray, edges: np.ndarray) -> None:
-    """Draw the PDFs of true and modelled values, and a Gaussian.
+def looks(methods: Mapping[str, Sequence[str]], cells: Mapping[str, int]) -> dict[str, Look]:
+    """Return the colour and the marker of each variant.
 
-    Values are standardised with the mean and the standard deviation of the truth. `edges` are the edges of the bins for
-    these standardised values.
+    methods: for each variant, by its name, the names in LOOKS that suit it; the first one that no earlier variant has
+    is taken. cells: for variants on a grid, the number of cells along its edge; the fewer, the lighter the colour.
     """
-    centres = bin_centres(edges)
-    densities = (pdf(standardized(values, truth), edges) for values in (truth, model))
-    true, modelled = (np.where(density > 0, density, np.nan) for density in densities)
-    axis.semilogy(centres, gaussian(centres), color=GUIDE, linestyle=":", label="Gaussian")
-    axis.semilogy(centres, true, color=TRUTH, label="truth")
-    axis.semilogy(centres, modelled, color=MODEL, linestyle="none", marker="o", markersize=3.3,
-                  markerfacecolor="none", label="model")
-    axis.set_ylim(0.4 / truth.size / (edges[1] - edges[0]), 2)
+    found: dict[str, Look] = {}
+    free, sizes = iter(itertools.cycle(OTHERS)), sorted(set(cells.values()))
+    for name, suiting in methods.items():
+        if name in cells:
+            white = LIGHTEST * (1 - sizes.index(cells[name]) / (len(sizes) - 1)) if len(sizes) > 1 else 0.0
+            found[name] = to_hex((1 - white) * np.array(to_rgb(BLUE)) + white), GRID
+        else:
+            known = (LOOKS[key] for key in suiting if key in LOOKS and LOOKS[key] not in found.values())
+            found[name] = next(known, None) or next(free)
+    return found
 
 
 def show_plane(axis: Axes, plane: np.ndarray, limits: tuple[float, float], colours: str):

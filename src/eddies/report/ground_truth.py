@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from eddies.report.figures import (BAR, DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SECOND, SIGNED, TRUTH,
+from eddies.report.figures import (BAR, BLUE, DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SECOND, SIGNED,
                                    colour_bar, guide_power_law, largest, legend_below, letter, mark_time, note,
                                    number_wavenumbers, panels, show_plane, styled)
 from eddies.report.page import Metric, Section
@@ -16,16 +16,16 @@ Table = Mapping[str, np.ndarray]
 HISTORY = (
     ("Kinetic energy", r"$\frac{1}{2}\langle u\cdot u\rangle$", (("energy", None, DNS, "-"),)),
     ("Dissipation", "energy rate", (
-        ("dissipation_rate", "dissipation", TRUTH, "-"),
+        ("dissipation_rate", "dissipation", BLUE, "-"),
         ("injection_rate", "injection", FOURTH, "--"))),
     ("Taylor Reynolds number", r"$Re_\lambda$", (("reynolds_lambda", None, DNS, "-"),)),
     ("Resolution", r"$k_{\max}\,\eta$", (("kmax_eta", None, DNS, "-"),)),
     ("Compressibility", "fraction", (
-        ("mach_turbulent", r"$M_t$", TRUTH, "-"),
+        ("mach_turbulent", r"$M_t$", BLUE, "-"),
         ("density_rms", r"$\rho_{rms}/\rho_0$", MODEL, "--"),
         ("compressible_fraction", "energy", SECOND, "-."))),
     ("Longitudinal gradient", "moment", (
-        ("skewness", "skewness", TRUTH, "-"),
+        ("skewness", "skewness", BLUE, "-"),
         ("flatness", "flatness", MODEL, "--"))),
 )
 # The panel with a logarithmic axis, and the smallest value in it: smaller ones are only rounding errors.
@@ -67,10 +67,9 @@ def section(statistics: Table, spectra: Table, reference: Mapping[str, float], p
     shown = Section(
         "ground_truth", "Ground truth", f"{source} Numbers {when}, t = {at['time']:.3g}.",
         metrics=[Metric(key, label, at.get(key), reasons.get(key, ""))
-                 for key, label in METRICS.items() if key in at or key == "mach_turbulent"],
-        main=("reynolds_lambda", "kmax_eta", "mach_turbulent"))
+                 for key, label in METRICS.items() if key in at or key == "mach_turbulent"])
     shown.add_figure(
-        "statistics", "History of the simulation", statistics_history(statistics, released),
+        "statistics", "History of the simulation", lambda: statistics_history(statistics, released),
         f"From t = {times[0]:.3g} to {times[-1]:.3g}. Energy {when}: {at['energy']:.3g}; dissipation rate: "
         f"{at['dissipation_rate']:.3g}.")
     frame = -1 if released is None else int(np.argmin(np.abs(spectra["time"])))
@@ -81,8 +80,8 @@ def section(statistics: Table, spectra: Table, reference: Mapping[str, float], p
         caption += (f" The filter of width d = {width:.3g} keeps {filtered.sum() / energy.sum():.1%} of the energy. "
                     "Dotted: its wavenumber k_d = π/d.")
     shown.add_figure("spectra", "Energy spectrum of the ground truth",
-                     energy_spectra(spectra["wavenumber"], energy, filtered, width), caption)
-    shown.add_figure("fields", "Velocity and vorticity", field_planes(**planes),
+                     lambda: energy_spectra(spectra["wavenumber"], energy, filtered, width), caption)
+    shown.add_figure("fields", "Velocity and vorticity", lambda: field_planes(**planes),
                      f"Plane z = π of the last stored {field_name} field.")
     return shown
 

@@ -86,14 +86,13 @@ def section(support: float, kernels: Mapping[str, np.ndarray], slices: Mapping[s
     metrics += [error(f"{start}{field}_error", f"error of the {field} field, {words}", f"{field}_error_{name}")
                 for name, (start, words) in ERRORS.items() for field in ("velocity", "gradient")]
     shown = Section("kernel", "Smoothing kernel", "Fields reconstructed from particles by each kernel, compared with "
-                    "the filtered field. Errors are normalised L2 errors over a whole unseen field.",
-                    metrics=metrics, main=("velocity_error", "gradient_error"))
+                    "the filtered field. Errors are normalised L2 errors over a whole unseen field.", metrics=metrics)
     shown.add_figure(
-        "figure-1-kernels", "Kernels and their derivatives (the paper's Fig. 1)", shapes(kernels),
+        "figure-1-kernels", "Kernels and their derivatives (the paper's Fig. 1)", lambda: shapes(kernels),
         f"Support h = {support:.3g}. The integral of the learned kernel is {errors['integral_learned']:.6f}.")
     shown.add_figure(
         "figure-2-reconstruction", "Fields reconstructed from particles (the paper's Fig. 2)",
-        reconstructed_planes(slices, errors),
+        lambda: reconstructed_planes(slices, errors),
         "Plane z = π of an unseen frame. Numbers in titles: normalised error over the whole field. Learned kernel: "
         f"velocity {errors['velocity_error_learned']:.3f}, gradient {errors['gradient_error_learned']:.3f}.")
     return shown

@@ -7,12 +7,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from eddies.clock import duration
-from eddies.report.figures import (DNS, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, legend_at_foot, letter, panels,
+from eddies.report.figures import (BLUE, DNS, FOURTH, GUIDE, MODEL, SECOND, THIRD, legend_at_foot, letter, panels,
                                    styled)
 
 LOSSES = (
     ("loss", "total", DNS), ("trajectory_loss", "trajectory $L_t$", MODEL),
-    ("field_loss", "field $L_f$", TRUTH), ("velocity_kl_loss", "velocity KL", SECOND),
+    ("field_loss", "field $L_f$", BLUE), ("velocity_kl_loss", "velocity KL", SECOND),
     ("acceleration_kl_loss", "acceleration KL", FOURTH), ("rollout_loss", "velocity over the horizon", THIRD),
     ("density_loss", "density over the horizon", "#e377c2"),
     ("energy_loss", "energy over the horizon", "#56B4E9"), ("power_loss", "power", "#8c564b"),
@@ -26,10 +26,7 @@ def curves(history: Mapping[str, np.ndarray]) -> Figure:
 
     history: columns (steps,). A loss that is not used in a step is NaN; a loss that is never used has no column.
     """
-    # Steps of the first phase are drawn in (0, 1], those of the second in (1, 2], and so on.
-    _, index, count = np.unique(history["phase"], return_inverse=True, return_counts=True)
-    before = np.cumsum(count) - count
-    history = {**history, "place": index + (np.arange(len(index)) - before[index] + 1) / count[index]}
+    history = _placed(history)
     figure, axes = panels(1, 2, (5.3, 3.2), below=0.15, foot=0.5)
     losses, errors = axes[0]
     for name, label, colour in LOSSES:
@@ -42,6 +39,35 @@ def curves(history: Mapping[str, np.ndarray]) -> Figure:
     legend_at_foot(figure, losses, 4)
     letter(axes.flat)
     return figure
+
+
+@styled
+def curves_of_several(histories: Mapping[str, tuple[Mapping[str, np.ndarray], str]]) -> Figure:
+    """Draw total losses and validation errors of several trainings over the share of the steps, all phases equally
+    wide. The histories and their colours are given by label."""
+    figure, ((losses, errors),) = panels(1, 2, (5.3, 3.2), foot=0.1 + 0.2 * -(-len(histories) // 5))
+    for label, (history, colour) in histories.items():
+        history = _placed(history)
+        history["place"] = history["place"] / history["place"][-1]
+        _noisy(losses, history, "loss", colour, label)
+        error = history.get("validation_error", np.full(len(history["step"]), np.nan))
+        for number in np.unique(history["phase"]):
+            chosen = (history["phase"] == number) & np.isfinite(error)
+            errors.plot(history["place"][chosen], error[chosen], color=colour, marker="o", markersize=3)
+    losses.set(title="Losses", ylabel="total loss", yscale="log", xlabel="share of the training, phases equally wide")
+    errors.set(title="Validation error", ylabel="validation error", ylim=(0, None),
+               xlabel="share of the training, phases equally wide")
+    legend_at_foot(figure, losses, 5)
+    letter((losses, errors))
+    return figure
+
+
+def _placed(history: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return a history with a column `place`. Steps of the first phase have places in (0, 1], those of the second in
+    (1, 2], and so on."""
+    _, index, count = np.unique(history["phase"], return_inverse=True, return_counts=True)
+    before = np.cumsum(count) - count
+    return {**history, "place": index + (np.arange(len(index)) - before[index] + 1) / count[index]}
 
 
 def _mark_phases(axis: Axes, history: Mapping[str, np.ndarray]) -> None:

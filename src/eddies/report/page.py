@@ -1,8 +1,7 @@
-"""The report as one HTML page that needs no other file, and its metrics as JSON."""
+"""The report as one HTML page that needs no other file."""
 
 import base64
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -48,23 +47,22 @@ class Metric:
 class Illustration:
     """A figure of the page, with its title and its caption.
 
-    name: name of its file without the ending. figure: a matplotlib figure. png: the figure as a PNG image; empty until
-    it is drawn.
+    name: name of its file without the ending. make: makes the matplotlib figure. png: the figure as a PNG image; empty
+    until it is drawn.
     """
 
     name: str
     title: str
-    figure: Any
+    make: Callable[[], Any]
     caption: str
     png: bytes = b""
 
 
 @dataclass
 class Section:
-    """A section of the page. Its metrics are in metrics.json under the key `key`.
+    """A section of the page.
 
-    notices: sentences in coloured boxes. main: keys of the metrics that are shown beside the title. folded: whether
-    the section shows only its title and its main metrics until it is opened.
+    notices: sentences in coloured boxes. folded: whether the section shows only its title until it is opened.
     """
 
     key: str
@@ -73,17 +71,16 @@ class Section:
     notices: list[str] = field(default_factory=list)
     illustrations: list[Illustration] = field(default_factory=list)
     metrics: list[Metric] = field(default_factory=list)
-    main: Sequence[str] = ()
     folded: bool = False
 
-    def add_figure(self, name: str, title: str, figure: Any, caption: str) -> None:
-        """Append a matplotlib figure."""
-        self.illustrations.append(Illustration(name, title, figure, caption))
+    def add_figure(self, name: str, title: str, make: Callable[[], Any], caption: str) -> None:
+        """Append a figure. `make` makes it."""
+        self.illustrations.append(Illustration(name, title, make, caption))
 
     @property
-    def tiles(self) -> list[Metric]:
-        """The main metrics that have a value."""
-        return [metric for metric in self.metrics if metric.key in self.main and metric.value is not None]
+    def numbers(self) -> dict[str, Number]:
+        """The values of the metrics by key, for metrics.json."""
+        return {metric.key: metric.value for metric in self.metrics}
 
     @property
     def columns(self) -> list[str]:
@@ -98,7 +95,7 @@ class RunRecord:
     """What the page shows of the run itself, such as its name, its title and the text of its scene.
 
     products: rows of a table; the first is the header, and each other row is on a product. warnings: sentences on
-    products that do not fit together. links: title and relative path of each page to which this one has a link.
+    products that do not fit together.
     """
 
     name: str
@@ -106,7 +103,6 @@ class RunRecord:
     scene: str
     products: Sequence[Sequence[str]]
     warnings: Sequence[str] = ()
-    links: Sequence[tuple[str, str]] = ()
 
 
 def arranged(sections: Sequence[Section]) -> list[Section]:
@@ -130,15 +126,27 @@ def shown(value: Number) -> str:
     return str(value)
 
 
-def metrics_json(warnings: Sequence[str], sections: Sequence[Section]) -> str:
-    """Return the warnings and the metrics of each section as strict JSON, in which a missing value is null."""
-    table = {"warnings": list(warnings),
-             **{section.key: {metric.key: metric.value for metric in section.metrics} for section in sections}}
-    return json.dumps(table, indent=2, allow_nan=False) + "\n"
+def side_by_side(columns: Mapping[str, Sequence[Metric]]) -> list[Metric]:
+    """Return one metric for each key in the metrics of several variants, with a value for each variant."""
+    values: dict[str, dict[str, Any]] = {}
+    labels = {metric.key: metric.label for metrics in reversed(columns.values()) for metric in metrics}
+    for name, metrics in columns.items():
+        for metric in metrics:
+            missing = f"not available: {metric.reason}" if metric.value is None else None
+            value = shown(metric.value) if isinstance(metric.value, dict) else metric.value
+            values.setdefault(metric.key, {})[name] = missing or metric.written or value
+    return [Metric(key, labels[key], value) for key, value in values.items()]
+
+
+def strict(value: Any) -> Any:
+    """Return a value for JSON: None for a float that is not finite, also within dicts and lists."""
+    if isinstance(value, Mapping):
+        return {key: strict(part) for key, part in value.items()}
+    return [strict(part) for part in value] if isinstance(value, list | tuple) else finite(value)
 
 
 def write_page(output: Path, run: RunRecord, sections: Sequence[Section], beside: Mapping[str, str]) -> None:
-    """Write index.html, metrics.json, figures/NAME.png and further text files to the directory `output`.
+    """Write index.html, figures/NAME.png and further text files to the directory `output`.
 
     `beside` maps the names of the further files to their texts. If the directory has an earlier page, its figures that
     the new page lacks are removed. Raises OSError or WriteError. If a file cannot be written, no existing file is
@@ -148,7 +156,7 @@ def write_page(output: Path, run: RunRecord, sections: Sequence[Section], beside
     (output / "figures").mkdir(parents=True, exist_ok=True)
     figures = {output / "figures" / f"{each.name}.png": each.png
                for section in sections for each in section.illustrations if each.png}
-    texts = {"index.html": render_page(run, sections), "metrics.json": metrics_json(run.warnings, sections), **beside}
+    texts = {"index.html": render_page(run, sections), **beside}
     write_files({**figures, **{output / name: text for name, text in texts.items()}})
     for path in (output / "figures").glob("*.png"):
         if earlier and path not in figures:

@@ -5,13 +5,13 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from eddies.report.figures import (BAR, DNS, MODEL, SIGNED, TRUTH, colour_bar, largest, letter, panels, show_plane,
+from eddies.report.figures import (BAR, BLUE, DNS, MODEL, SIGNED, colour_bar, largest, letter, panels, show_plane,
                                    styled)
 from eddies.report.page import Metric, Section
 
 ERRORS = {  # column of the table: label, colour, line style
     "validation_error": ("velocity at tracks left out", MODEL, "--"),
-    "velocity_error": ("velocity field", TRUTH, "-"),
+    "velocity_error": ("velocity field", BLUE, "-"),
     "gradient_error": ("velocity gradient", DNS, ":")}
 
 
@@ -38,9 +38,8 @@ def section(about: Mapping[str, float | str], errors: Mapping[str, np.ndarray], 
     if about["holdout"]:
         text += (f" A second reconstruction leaves out {about['holdout']:.0%} of the tracks. Its error at these tracks "
                  "estimates the error of the field.")
-    shown = Section("reconstruction", "Reconstruction", text, metrics=metrics,
-                    main=("validation_error", "velocity_error", "gradient_error"))
-    shown.add_figure("reconstruction", "Reconstructed fields", overview(both, plane),
+    shown = Section("reconstruction", "Reconstruction", text, metrics=metrics)
+    shown.add_figure("reconstruction", "Reconstructed fields", lambda: overview(both, plane),
                      "Normalised L2 errors over time" + (", and u_x in the plane z = π of the last frame." if plane
                                                          is not None else "."))
     return shown

@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 from eddies.analysis.isotropic_turbulence import acceleration_constant
 from eddies.analysis.pdfs import bin_centres, gaussian
 from eddies.analysis.tracer_statistics import EDGES, TracerStatistics
-from eddies.report.figures import DNS, FOURTH, GUIDE, MODEL, SECOND, TRUTH, letter, number_wavenumbers, panels, styled
+from eddies.report.figures import BLUE, DNS, FOURTH, GUIDE, MODEL, SECOND, letter, number_wavenumbers, panels, styled
 from eddies.report.page import Metric, Section
 
-COLOURS = (TRUTH, MODEL, SECOND, FOURTH)
+COLOURS = (BLUE, MODEL, SECOND, FOURTH)
 TOO_FEW = "there are too few frames, or too few pairs of tracers"
 
 
@@ -53,7 +53,7 @@ def section(found: TracerStatistics, scales: Mapping[str, float], power: float |
                  "literature's for the whole flow.")
     shown = Section("tracers", "Tracers", text, metrics=metrics)
     shown.add_figure(
-        "tracers", "Statistics of the tracers", tracers(found, scales),
+        "tracers", "Statistics of the tracers", lambda: tracers(found, scales),
         "A: energy; grey: two standard deviations for the same number of random points. B: accelerations from "
         f"differences of frames, in units of their rms at the time; kurtosis {kurtosis:.3g}. C: structure function of "
         "a velocity component. D: pairs by their initial distance r₀; dashed: the ballistic law S₂(r₀) t² from their "
@@ -76,14 +76,14 @@ def tracers(found: TracerStatistics, scales: Mapping[str, float]) -> Figure:
     _energy_panel(energy, found, scales["eddy_turnover_time"])
     centres = bin_centres(EDGES)
     seen = found.probability > 0
-    acceleration.semilogy(centres[seen], found.probability[seen], color=TRUTH, label="tracers")
+    acceleration.semilogy(centres[seen], found.probability[seen], color=BLUE, label="tracers")
     acceleration.semilogy(centres, gaussian(centres), color=GUIDE, linestyle="--", label="Gaussian")
     reach = np.abs(centres[seen]).max(initial=5.0) + 1
     acceleration.set(title="Acceleration", xlabel=r"$a_i\,/\,a_{rms}$", ylabel="PDF", xlim=(-reach, reach),
                      ylim=(found.probability[seen].min(initial=1e-3) / 2, 2))
     acceleration.legend()
     lags, squared = found.lags / time_unit, found.structure[0] * (found.lags / found.lags[0]) ** 2
-    memory.loglog(lags, found.structure, "o-", color=TRUTH, markersize=3.5)
+    memory.loglog(lags, found.structure, "o-", color=BLUE, markersize=3.5)
     _guide(memory, lags, squared, found.structure.max(), r"$\tau^2$")
     memory.set(title="Structure function", xlabel=rf"lag $\tau/{time_name}$",
                ylabel=r"$\langle(\Delta_\tau v_i)^2\rangle$")
@@ -107,7 +107,7 @@ def _energy_panel(axis: Axes, found: TracerStatistics, turnover: float) -> None:
     time, error = found.field_times / turnover, 2 * found.energy_error
     axis.fill_between(time, 1 - error, 1 + error, color=GUIDE, alpha=0.3, linewidth=0)
     axis.axhline(1, color=GUIDE, linestyle="--", linewidth=1.1)
-    axis.plot(time, found.energy_ratio, "o-", color=TRUTH, markersize=3)
+    axis.plot(time, found.energy_ratio, "o-", color=BLUE, markersize=3)
     reach = 1.3 * max(np.abs(found.energy_ratio - 1).max(), error.max())
     axis.set(title="Energy, tracers / field", xlabel="time $t/T$", ylabel=r"$\langle v\cdot v\rangle$ ratio",
              ylim=(1 - reach, 1 + reach))

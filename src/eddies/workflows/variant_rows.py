@@ -9,11 +9,10 @@ from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from eddies.analysis.accuracy import accuracy
 from eddies.analysis.pareto import break_even
 from eddies.cores import threads
 from eddies.io.hdf5 import open_product
@@ -24,9 +23,6 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene, Tracers
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import FAILURE, of_other_settings, read_found_step, step_path
-
-if TYPE_CHECKING:
-    from eddies.workflows.rollout.measured import MeasuredRollout  # needs torch
 
 COST = ("seconds_per_step", "time_step", "wall_seconds", "wall_seconds_low", "wall_seconds_high", "core_seconds",
         "ranks")
@@ -198,15 +194,14 @@ def notes(seeds: Sequence[int], without_kernel: Sequence[str], tracers: Mapping[
     return found
 
 
-def numbers(stored: MeasuredRollout) -> dict[str, Any]:
-    """Return status, accuracy and cost of an open rollout."""
-    rollout, ranks = stored.rollout, stored.provenance["ranks"]
-    attributes = rollout.attributes
-    found = {"status": rollout.status, "ranks": ranks, **accuracy(rollout),
-             "stopped_at": None if rollout.status == "complete" else attributes["turnovers"],
+def numbers(measured: Mapping[str, Any]) -> dict[str, Any]:
+    """Return status, accuracy and cost of a rollout from the numbers of its measures."""
+    attributes, ranks = measured["attributes"], measured["ranks"]
+    found = {"status": attributes["status"], "ranks": ranks, **measured["accuracy"],
+             "stopped_at": None if attributes["status"] == "complete" else attributes["turnovers"],
              "time_step": attributes.get("time_step")}  # missing if the first step failed
     if "seconds_per_step" in attributes:
-        found |= step_costs(attributes, rollout.turnover, ranks)
+        found |= step_costs(attributes, attributes["eddy_turnover_time"], ranks)
     return found
 
 

@@ -1,35 +1,27 @@
-"""Measures of a rollout in a run directory and of the true tracers in its ground truth."""
+"""A rollout in a run directory, the true tracers in its ground truth, and measures of both."""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from eddies.analysis.rollout import PLANES, Plane, Rollout, same_times
+from eddies.analysis.isotropic_turbulence import StationarySpan
+from eddies.analysis.rollout import Plane, Rollout, same_times
 from eddies.analysis.velocity_gradients import Invariants
 from eddies.io.hdf5 import ProductError, open_product, read_attributes, read_table
 from eddies.io.provenance import read_provenance
 from eddies.io.trajectories import IMAGE, Trajectory
-from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.devices import prepare_torch
+from eddies.workflows.ground_truth.stationary import read_stationary_span
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import load_form
 from eddies.workflows.rollout.particle_measures import GRADIENT, ParticleSpectra, ReconstructedFields, WithGradients
-
-log = logging.getLogger("eddies")
-
-Task = tuple[str, str, int]  # quantity ("spectra", "invariants" or "planes"), "model" or "truth", frame
-#: Measures of true tracers. A key holds the files of ground truth and kernel (None for spectra), the quantity, and the
-#: frame of the ground truth. The rank that made a measure holds its value; the other ranks hold None.
-TruthMeasures = dict[tuple[Path, Path | None, str, int], Any]
 
 
 class TrueParticles:
@@ -101,28 +93,24 @@ class OnDemand(dict):
         return found
 
 
+@dataclass(frozen=True)
 class MeasuredRollout:
-    """An open rollout on one rank, with its measures at single frames: spectra, invariants of the velocity gradient,
-    and planes of the velocity and the vorticity.
-
-    All ranks can compute measures together with `measure`. Any other measure is computed by this rank when it is first
-    used, and kept.
+    """An open rollout on one rank. Its measures are made when they are first used, and kept.
 
     Parameters
     ----------
     rollout : the rollout and its truth.
     provenance : provenance of rollout.h5.
-    directory : the run directory.
     fields : the reconstructed fields of "model" and "truth"; empty if the kernel or the ground truth is missing.
     solver : makes spectra of particles; None without a ground truth.
-    stationary : whether the ground truth has a stationary state.
+    stationary : the stationary state of the ground truth; None without one.
     """
 
-    def __init__(self, rollout: Rollout, provenance: Mapping[str, Any], directory: Path,
-                 fields: Mapping[str, ReconstructedFields], solver: ParticleSpectra | None = None,
-                 stationary: bool = False) -> None:
-        self.rollout, self.provenance, self._directory = rollout, provenance, directory
-        self._fields, self._solver, self._stationary = fields, solver, stationary
+    rollout: Rollout
+    provenance: Mapping[str, Any]
+    fields: Mapping[str, ReconstructedFields]
+    solver: ParticleSpectra | None = None
+    stationary: StationarySpan | None = None
 
     @property
     def particles(self) -> dict[str, Any]:
@@ -137,9 +125,9 @@ class MeasuredRollout:
 
         Without a kernel, there are no fields, and the particles have no velocity gradients.
         """
-        if not self._fields:
+        if not self.fields:
             return {"fields": {}, "particles": self.particles}
-        fields = {name: self._fields[name] for name in self.particles}
+        fields = {name: self.fields[name] for name in self.particles}
         return {"fields": fields,
                 "particles": {name: WithGradients(run, fields[name]) for name, run in self.particles.items()}}
 
@@ -148,83 +136,13 @@ class MeasuredRollout:
         """The series that `open_run` adds to the stored ones. They have names like those of groups in a product."""
         found: dict[str, Any] = {f"particles/{name}": run for name, run in self.particles.items() if name != "model"}
         for name, run in self.particles.items():
-            if self._solver is not None:
+            if self.solver is not None:
                 found[f"spectra_of_{name}"] = ComputedSeries(run.times, "energy",
                                                              self.rollout.spectra[name].__getitem__)
-            if self._fields:
-                found[f"fields/{name}"] = self._fields[name]
-                found[f"gradients/{name}"] = ComputedSeries(run.times, GRADIENT, self._fields[name].gradients)
+            if self.fields:
+                found[f"fields/{name}"] = self.fields[name]
+                found[f"gradients/{name}"] = ComputedSeries(run.times, GRADIENT, self.fields[name].gradients)
         return found
-
-    def measure(self, comm: Comm, root: int = 0, page: bool = True, every_frame: bool = True,
-                known: TruthMeasures | None = None) -> None:
-        """Measure a share of the frames on each rank and collect everything on rank `root`; all ranks call it.
-
-        page: if true, measure what a page of the report shows; if false, only what `accuracy` needs. every_frame: if
-        true, measure the velocity gradient at all common frames and, for a page, spectra at several frames; if false,
-        measure both only at the last common frame. known: measures of true tracers from earlier calls; new ones are
-        added. Ranks other than `root` keep only the measures in `known`. Raises ProductError on all ranks if one of
-        them cannot read a frame.
-        """
-        if self._solver is None:
-            return
-        known = {} if known is None else known
-        prepare_torch("cpu", comm)
-        tasks = on_all_ranks(comm, lambda: self._tasks(page, every_frame), ProductError)
-        new = [task for task in tasks if self._key(task) not in known]
-        own = on_all_ranks(comm, lambda: {(quantity, of, frame): getattr(self.rollout, quantity)[of][frame]
-                                          for quantity, of, frame in new[comm.rank::comm.size]}, ProductError)
-        for maker in (self._solver, *self._fields.values()):
-            maker.forget()  # saves memory, because many rollouts are open at a time
-        for task in new:
-            if task[1] == "truth":
-                known[self._key(task)] = own.get(task)
-        own |= {task: known[self._key(task)] for task in tasks if known.get(self._key(task)) is not None}
-        parts = comm.gather(own, root)
-        if parts is None:
-            self.forget()
-        for part in parts or []:
-            for (quantity, of, frame), value in part.items():
-                getattr(self.rollout, quantity)[of][frame] = value
-        complaints = [words for some in comm.allgather(self._solver.complaints) for words in some]
-        if complaints and comm.rank == 0:
-            log.info("report: %s", complaints[0] + (f" ({len(complaints)} such solves)" if complaints[1:] else ""))
-
-    def forget(self) -> None:
-        """Free all measures. A measure that is used later is computed again."""
-        for measures in (self.rollout.spectra, self.rollout.invariants, self.rollout.planes):
-            for of_frames in (measures or {}).values():
-                of_frames.clear()
-
-    def _tasks(self, page: bool, every_frame: bool) -> list[Task]:
-        """List the measures to make, with `page` and `every_frame` as in `measure`. The list is empty if model and
-        truth have no common frame."""
-        run = self.rollout
-        try:
-            common = run.common
-        except ValueError:
-            return []
-        every = np.arange(len(common.times))
-        chosen = {"spectra": run.shown_spectra(every_frame) if page else np.intersect1d(run.spectral(), every[-1])}
-        if self._fields:
-            chosen["invariants"] = every if every_frame else every[-1:]
-            chosen["planes"] = common.spread(PLANES if page else 0)
-        tasks = [(quantity, of, int(frame)) for quantity, rows in chosen.items()
-                 for of, frames in (("model", common.model), ("truth", common.truth)) for frame in frames[rows]]
-        if page and run.forced and self._stationary:
-            tasks += [("spectra", "model", int(frame)) for frame in run.late_spectra()]
-            if self._fields:
-                tasks += [("invariants", "truth", 0), *(("invariants", "model", int(frame)) for frame in run.late)]
-        return list(dict.fromkeys(tasks))
-
-    def _key(self, task: Task) -> Any:
-        """Return the key in TruthMeasures of a measure of true tracers. Measures of the model are not kept there: for
-        these, return the task itself."""
-        quantity, of, frame = task
-        if of == "model":
-            return task
-        kernel = (self._directory / "kernel.h5").resolve() if quantity != "spectra" else None
-        return (self._directory / "ground_truth.h5").resolve(), kernel, quantity, int(self.rollout.truth.frames[frame])
 
 
 @contextmanager
@@ -250,7 +168,7 @@ def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
             "closure": read_table(file, "closure") if "closure" in file else None}
         if truth_file is None:
             yield MeasuredRollout(Rollout(attributes, model, NOTHING, {}, {}, {}, None, **tables,
-                                          without_truth=missing), provenance, directory, {})
+                                          without_truth=missing), provenance, {})
             return
         ground = GroundTruth(truth_file, alone)
         truth = TrueParticles(ground.trajectory, attributes["start_time"], model.times)
@@ -266,4 +184,8 @@ def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
         planes = {name: OnDemand(lambda frame, own=own: Plane(*own.plane(frame))) for name, own in fields.items()}
         rollout = Rollout(attributes, model, truth, read_table(truth_file, "spectra"), ground.reference,
                           spectra, invariants or None, planes or None, **tables, reconstructed_by=words)
-        yield MeasuredRollout(rollout, provenance, directory, fields, solver, "stationary" in truth_file)
+        span = None
+        if "stationary" in truth_file:
+            with suppress(ProductError):  # the report says that the span is too short
+                span = read_stationary_span(truth_file)
+        yield MeasuredRollout(rollout, provenance, fields, solver, span)

@@ -1,9 +1,9 @@
-"""Training and coefficients in the section on a model."""
+"""Training and coefficients in the section on models."""
 
 import numpy as np
 
-from eddies.report.model import coefficient_metrics, source_metrics, training_metrics
-from eddies.report.page import RunRecord, Section, metrics_json, render_page
+from eddies.report.models import coefficient_metrics, source_metrics, training_metrics
+from eddies.report.page import side_by_side
 
 PHASES = [{"phase": "one step", "steps": 40, "seconds": 1.5, "error": 0.2},
           {"phase": "horizon 4", "steps": 8, "seconds": 2.0, "error": 0.1}]
@@ -34,6 +34,6 @@ def test_coefficients_are_written_as_learned_and_in_the_units_of_the_flow():
     one, several = coefficient_metrics({"coefficients": COEFFICIENTS})
     assert (one.key, one.label) == ("eddy-viscosity |a_1|", "eddy-viscosity, |a_1|: friction of a pair")
     assert one.written == "0.1, that is 0.25 L/T" and several.written == "0.1, 0.2"
-    section = Section("model", "Model", metrics=[one, training_metrics({})[0]])
-    assert '"value": 0.25,\n      "unit": "L/T"' in metrics_json([], [section])
-    assert "0.1, that is 0.25 L/T" in render_page(RunRecord("run", "", "", [("stage",)]), [section])
+    assert one.value["value"] == 0.25 and one.value["unit"] == "L/T"
+    row, = side_by_side({"resolved": [one]})
+    assert row.label == one.label and row.value == {"resolved": "0.1, that is 0.25 L/T"}

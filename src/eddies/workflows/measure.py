@@ -1,0 +1,129 @@
+"""Measures of a rollout: the numbers and small arrays by which it is compared with its truth, in measures.h5."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eddies.analysis.rollout import PLANES
+from eddies.analysis.rollout_measures import Tables, measures, of_model
+from eddies.io.hdf5 import ProductError, create_product, in_files, open_product, read_table, write_table
+from eddies.io.new_files import set_attributes
+from eddies.io.provenance import product_ids, product_provenance, read_json
+from eddies.measures import MEASURES
+from eddies.parallel.broadcast import on_all_ranks, on_first_rank
+from eddies.parallel.communicator import Comm
+from eddies.particles.devices import prepare_torch
+from eddies.pipeline import MEASURED, STAGES
+from eddies.workflows.rollout.measured import MeasuredRollout, open_rollout
+
+log = logging.getLogger("eddies")
+
+MADE_FROM = "rollout", "ground_truth", "kernel"
+Task = tuple[str, str, int]  # quantity ("spectra", "invariants" or "planes"), "model" or "truth", frame
+
+
+def run(directory: Path, comm: Comm) -> None:
+    """Measure the rollout of a run directory and write measures.h5; all ranks call it.
+
+    Raises ProductError on all ranks if a product cannot be read, and WriteError if measures.h5 cannot be written.
+    """
+    alone = comm.Split(comm.rank)
+    try:
+        with on_all_ranks(comm, lambda: open_rollout(directory, alone), ProductError) as opened:
+            _share(opened, comm)
+            in_files(comm, directory, lambda: _write(directory, opened, alone, comm.size))
+    finally:
+        alone.Free()
+
+
+def rollouts_in(directory: Path, comm: Comm) -> list[Path]:
+    """Return the directories of all rollouts in a run directory. Raises ProductError if there are none."""
+    found = in_files(comm, directory, lambda: sorted(path.parent for path in directory.rglob(STAGES["simulate"].file)))
+    if not found:
+        raise ProductError(f"{directory}: holds no rollout; run `eddies simulate SCENE` first")
+    return found
+
+
+def update(directory: Path, comm: Comm) -> None:
+    """Measure the rollout of a run directory unless measures.h5 fits the products there; all ranks call it."""
+    if on_first_rank(comm, lambda: not is_current(directory)):
+        run(directory, comm)
+
+
+def is_current(directory: Path) -> bool:
+    """Return whether measures.h5 was made from the rollout, the ground truth and the kernel beside it."""
+    made_from = product_provenance(directory / MEASURED).get("made_from")
+    return made_from is not None and made_from == product_ids(directory, MADE_FROM)
+
+
+def read(directory: Path, alone: Comm) -> tuple[dict[str, Any], Tables]:
+    """Return the numbers and the tables in measures.h5, as `measures` makes them, on one rank.
+
+    The numbers also have the keys `attributes`, the attributes of the rollout; `ranks`, those of the rollout;
+    `reconstructed_by`, the method by which fields are reconstructed from particles; `filter_width`; and `truth`, the id
+    of the ground truth.
+    """
+    with open_product(alone, directory / MEASURED, "measures") as file:
+        return read_json(file, "numbers"), {name: read_table(file, name) for name in file}
+
+
+def _write(directory: Path, opened: MeasuredRollout, alone: Comm, ranks: int) -> None:
+    rollout = opened.rollout
+    try:
+        numbers, tables = measures(rollout, opened.stationary)
+    except (ValueError, OverflowError) as error:  # NaN or infinity in positions, of which there is no PDF
+        numbers, tables = {"rollout": of_model(rollout), "accuracy": dict.fromkeys([*MEASURES, "end"]),
+                           "not_compared": str(error)}, {}
+    numbers |= {"attributes": rollout.attributes, "ranks": opened.provenance["ranks"],
+                "reconstructed_by": rollout.reconstructed_by, "filter_width": rollout.reference.get("filter_width"),
+                "truth": product_ids(directory, ("ground_truth",)).get("ground_truth")}
+    origin = {"scene": opened.provenance.get("scene", ""), "made_from": MADE_FROM, "ranks": ranks}
+    with create_product(alone, directory / MEASURED, "measures", origin) as file:
+        set_attributes(file, {"numbers": json.dumps(numbers, default=np.ndarray.tolist)})
+        for name, columns in tables.items():
+            write_table(file, name, columns)
+
+
+def _share(opened: MeasuredRollout, comm: Comm) -> None:
+    """Measure a share of the frames on each rank, and collect the results in the rollout of rank 0; all ranks call it.
+
+    Raises ProductError on all ranks if one of them cannot read a frame.
+    """
+    if opened.solver is None:
+        return
+    prepare_torch("cpu", comm)
+    rollout = opened.rollout
+    tasks = on_all_ranks(comm, lambda: _tasks(opened), ProductError)
+    own = on_all_ranks(comm, lambda: {(quantity, of, frame): getattr(rollout, quantity)[of][frame]
+                                      for quantity, of, frame in tasks[comm.rank::comm.size]}, ProductError)
+    for part in comm.gather(own) or []:
+        for (quantity, of, frame), value in part.items():
+            getattr(rollout, quantity)[of][frame] = value
+    complaints = [words for some in comm.allgather(opened.solver.complaints) for words in some]
+    if complaints and comm.rank == 0:
+        log.info("measures: %s", complaints[0] + (f" ({len(complaints)} such solves)" if complaints[1:] else ""))
+
+
+def _tasks(opened: MeasuredRollout) -> list[Task]:
+    """List the measures of single frames. The list is empty if model and truth have no common frame."""
+    run = opened.rollout
+    try:
+        common = run.common
+    except ValueError:
+        return []
+    chosen: Mapping[str, np.ndarray] = {"spectra": run.shown_spectra()}
+    if opened.fields:
+        chosen |= {"invariants": np.arange(len(common.times)), "planes": common.spread(PLANES)}
+    tasks = [(quantity, of, int(frame)) for quantity, rows in chosen.items()
+             for of, frames in (("model", common.model), ("truth", common.truth)) for frame in frames[rows]]
+    if run.forced and opened.stationary is not None:
+        tasks += [("spectra", "model", int(frame)) for frame in run.late_spectra()]
+        if opened.fields:
+            tasks += [("invariants", "truth", 0), *(("invariants", "model", int(frame)) for frame in run.late)]
+    return list(dict.fromkeys(tasks))
