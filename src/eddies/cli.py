@@ -24,7 +24,7 @@ from eddies.clock import duration
 from eddies.cores import check_threads, default_to_one_thread
 from eddies.errors import UserError
 from eddies.logs import OUTCOME, configure_logging, show_warnings
-from eddies.pipeline import MEASURED, STAGES
+from eddies.pipeline import FILE_OF, STAGES
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 
 if TYPE_CHECKING:
@@ -205,7 +205,7 @@ def measure_command(options: argparse.Namespace, comm: Comm) -> None:
     from eddies.workflows import measure
     for where in measure.rollouts_in(options.run, comm):
         measure.run(where, comm)
-        log.log(OUTCOME, "measure: %s", where / MEASURED)
+        log.log(OUTCOME, "measure: %s", where / FILE_OF["measures"])
 
 
 def export_command(options: argparse.Namespace, comm: Comm) -> None:

@@ -48,7 +48,7 @@ def forced_averages(run: Rollout, span: StationarySpan) -> tuple[dict[str, Any],
         numbers |= {f"true_{name}": values for name, values in truth.items()}
     numbers["average_from"] = float(run.model.times[late[0]] / turnover)
     return numbers, {
-        "forced_spectra": {"wavenumber": wavenumber, "flow": spectra[0], "model": spectra[1]},
+        "forced_spectra": {"wavenumber": wavenumber, "energy_flow": spectra[0], "energy_model": spectra[1]},
         "forced_accelerations": dict(zip(("truth", "model"), shares["acceleration"]))}
 
 

@@ -7,12 +7,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from eddies.analysis.spectra import band_ratios, spectrum_error
 from eddies.analysis.velocity_gradients import Invariants
 from eddies.clock import ROUND_OFF, SAME
 
-SHOWN = 3   # largest number of times at which a report shows spectra of a rollout
-PLANES = 4  # largest number of times at which a report shows planes of a rollout
+SHOWN = 3  # largest number of times at which spectra of a rollout are measured
 # Columns by name. A table of spectra has wavenumber (shells,), time (m,), energy (m, shells).
 Table = Mapping[str, np.ndarray]
 
@@ -72,48 +70,6 @@ class Pair:
 
 
 @dataclass(frozen=True)
-class Plane:
-    """Velocity (3, n, n) and vorticity magnitude (n, n) in the plane z = pi, reconstructed from particles.
-
-    The velocity is relative to the mean over the particles. The last two axes are y, x.
-    """
-
-    velocity: np.ndarray
-    vorticity: np.ndarray
-
-
-@dataclass(frozen=True)
-class SpectraAt:
-    """Energy spectra (shells,) at one time, k = 0, 1, ...
-
-    `model` and `truth` come from the velocities of the particles. `filtered` is the spectrum of the filtered flow.
-    """
-
-    time: float
-    model: np.ndarray
-    truth: np.ndarray
-    filtered: np.ndarray
-
-    @property
-    def wavenumber(self) -> np.ndarray:
-        return np.arange(len(self.model))
-
-    def error(self, of: str, filter_wavenumber: float) -> float:
-        """Return the `spectrum_error` of a spectrum relative to the filtered flow, up to `filter_wavenumber`.
-
-        `of` names the spectrum: "model" or "truth".
-        """
-        return spectrum_error(getattr(self, of), self.filtered, filter_wavenumber)
-
-    def bands(self, of: str, filter_wavenumber: float) -> dict[str, float]:
-        """Return the `band_ratios` of a spectrum to that of the filtered flow, up to `filter_wavenumber`.
-
-        `of` names the spectrum: "model" or "truth".
-        """
-        return band_ratios(getattr(self, of), self.filtered, filter_wavenumber)
-
-
-@dataclass(frozen=True)
 class Rollout:
     """A rollout and the true particles, with measures of both in single frames.
 
@@ -129,7 +85,9 @@ class Rollout:
         of modes to the velocities of the particles.
     invariants : for "model" and "truth", the invariants of the velocity gradients at the particles, by frame number.
         None without a kernel, because the kernel reconstructs the gradients.
-    planes : for "model" and "truth", a plane of the reconstructed field, by frame number. None without a kernel.
+    planes : for "model" and "truth", velocity (3, n, n) and vorticity magnitude (n, n) of the reconstructed field in
+        the plane z = pi, by frame number. The velocity is relative to the mean over the particles. The last two axes
+        are y, x. None without a kernel.
     outside_training : share of the particle pairs for which an input of a network is outside its range in training,
         (frames,); None if it was not counted.
     closure : columns (frames,) `solves`, `iterations`, `most_iterations`, `residual` and `not_converged` of the
@@ -144,7 +102,7 @@ class Rollout:
     reference: Mapping[str, float]
     spectra: Mapping[str, Mapping[int, np.ndarray]]
     invariants: Mapping[str, Mapping[int, Invariants]] | None
-    planes: Mapping[str, Mapping[int, Plane]] | None = None
+    planes: Mapping[str, Mapping[int, tuple[np.ndarray, np.ndarray]]] | None = None
     outside_training: np.ndarray | None = None
     closure: Table | None = None
     without_truth: str = ""
@@ -245,17 +203,19 @@ class Rollout:
         frames = np.flatnonzero(chosen & (times < self.broken))
         return frames[second_half(times[frames], float(times[self.before_broken("model")[-1]]))]
 
-    def spectra_at(self, index: int) -> SpectraAt:
-        """Return the spectra at the common frame `index`, in the shells that all three spectra have.
+    def spectra_at(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the energy spectra (shells,) of model, truth and filtered flow at the common frame `index`, in the
+        shells that all three have.
 
         The spectrum of the filtered flow is the one at the nearest stored time.
         """
-        common = self.common
         model, truth = self.both(self.spectra, index)
-        nearest = int(np.argmin(np.abs(self.flow["time"] - (self.start_time + common.times[index]))))
         shells = min(len(model), self.flow["wavenumber"].size)
-        return SpectraAt(float(common.times[index]), model[:shells], truth[:shells],
-                         self.flow["filtered"][nearest][:shells])
+        return model[:shells], truth[:shells], self.flow["filtered"][self.flow_row(index)][:shells]
+
+    def flow_row(self, index: int) -> int:
+        """Return the row of the table `flow` whose time is the nearest to that of the common frame `index`."""
+        return int(np.argmin(np.abs(self.flow["time"] - (self.start_time + self.common.times[index]))))
 
     def _has_flow(self, times: np.ndarray) -> np.ndarray:
         return _contained(self.start_time + times, self.flow["time"])

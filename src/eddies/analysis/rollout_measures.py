@@ -1,24 +1,26 @@
 """All numbers and small arrays by which a rollout is compared with its truth."""
 
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
 from eddies.analysis import against_truth, disorder
-from eddies.analysis.accuracy import accuracy
 from eddies.analysis.against_truth import EDGES
-from eddies.analysis.errors import normalized_l2
+from eddies.analysis.errors import fluctuations, normalized_l2
 from eddies.analysis.forced import forced_averages
 from eddies.analysis.isotropic_turbulence import StationarySpan
-from eddies.analysis.lagrangian import PathStatistics, differences, of_both
-from eddies.analysis.pdfs import bin_probabilities, kl_divergence, standardized
-from eddies.analysis.rollout import PLANES, SHOWN, Rollout
-from eddies.analysis.velocity_gradients import ConditionalVelocity
+from eddies.analysis.lagrangian import differences, of_both
+from eddies.analysis.pdfs import bin_centres, bin_probabilities, kl_divergence, standardized
+from eddies.analysis.rollout import SHOWN, Rollout
+from eddies.analysis.spectra import band_ratios, spectrum_error
+from eddies.measures import MEASURES
 
 Tables = dict[str, dict[str, np.ndarray]]
 BOTH = "model", "truth"
+PLANES = 4  # largest number of times at which planes are measured
+FEWEST = 8  # smallest number of particles in a cell of the Q-R plane whose mean motion is kept
+OVER_LAGS = "structure", "flatness", "acceleration_correlation"
 
 
 def measures(run: Rollout, span: StationarySpan | None) -> tuple[dict[str, Any], Tables]:
@@ -29,7 +31,7 @@ def measures(run: Rollout, span: StationarySpan | None) -> tuple[dict[str, Any],
     state; and `not_compared`, the reason why the rollout is not compared with the truth, or "".
     """
     numbers, tables = of_model(run), {}
-    found: dict[str, Any] = {"rollout": numbers, "accuracy": accuracy(run), "not_compared": ""}
+    found: dict[str, Any] = {"rollout": numbers, "not_compared": ""}
     if run.forced and span is not None and len(run.truth.times):
         found["forced"], tables = forced_averages(run, span)
     if len(run.before_broken("model")):
@@ -37,14 +39,49 @@ def measures(run: Rollout, span: StationarySpan | None) -> tuple[dict[str, Any],
     try:
         last = float(run.common.times[-1])
     except ValueError as error:
-        return found | {"not_compared": str(error)}, tables
+        return found | {"accuracy": dict.fromkeys([*MEASURES, "end"]), "not_compared": str(error)}, tables
     numbers["last_common_time"] = last / run.turnover
     tables["truth"] = series(run, "truth")
     for add in (_particles, _planes, _invariants, _spectra, _paths, _disorder):
         more, arrays = add(run)
         numbers |= more
         tables |= arrays
-    return found, tables
+    return found | {"accuracy": accuracy(run, numbers, tables["errors"])}, tables
+
+
+def accuracy(run: Rollout, numbers: Mapping[str, Any], errors: Mapping[str, np.ndarray]) -> dict[str, float | None]:
+    """Return the measures of a rollout by their keys in MEASURES, and the end of the comparison by the key `end`.
+
+    The end is the last time that model and truth have in common, in units of the turnover time T. A measure is None if
+    its data are missing, for example because the rollout or the truth ends too early. Velocity errors are normalised L2
+    errors over all particles; they and the energy leave the mean velocity out. Those at the Kolmogorov time t_eta and
+    at T/2 are interpolated linearly between frames. The acceleration error is that of the first common frame. The other
+    measures are taken at the last common frame or, if they are Lagrangian statistics, over all common frames. These are
+    None for a rollout that stops early or has a frame that is not finite, because such a rollout ends earlier than the
+    others. They are taken from `numbers`, those of the rollout. `errors` is the table of `error_series`.
+    """
+    def at(time: float) -> float | None:
+        times = errors["time"]
+        return float(np.interp(time, times, errors["velocity_error"])) if times[0] <= time <= times[-1] else None
+
+    measures: dict[str, float | None] = dict.fromkeys(MEASURES)
+    if numbers["stable"]:
+        pairs = {name: values for name, values in numbers.items() if name in ("momentum_drift", "density_drift",
+                                                                              "count_variance")}
+        known = {**numbers, "velocity_error_end": numbers["velocity_error"],
+                 **{name: values["model"] for name, values in pairs.items()},
+                 **{f"{name}_floor": values["truth"] for name, values in pairs.items()}}
+        velocity, last = run.pair(-1, "velocity"), len(run.common.times) - 1
+        known["energy_ratio"] = float(np.sum(fluctuations(velocity.model) ** 2)
+                                      / np.sum(fluctuations(velocity.truth) ** 2))
+        if last not in run.spectral():
+            known |= dict.fromkeys(("spectrum_error", "spectrum_error_floor"))
+        measures = {key: known.get(key) for key in MEASURES}
+    start = run.pair(0, "acceleration")
+    return measures | {"velocity_error_early": at(run.reference["kolmogorov_time"]),
+                       "velocity_error_half": at(run.turnover / 2),
+                       "acceleration_error": normalized_l2(start.model, start.truth),
+                       "end": float(run.common.times[-1]) / run.turnover}
 
 
 def of_model(run: Rollout) -> dict[str, Any]:
@@ -91,76 +128,77 @@ def _particles(run: Rollout) -> tuple[dict[str, Any], Tables]:
     early = min(run.turnover / 2, float(errors["time"][-1]))
     early_error, early_without = (float(np.interp(early, errors["time"], errors[name]))
                                   for name in ("velocity_error", "no_force"))
-    last = {column: run.pair(-1, column) for column in EDGES}
-    accelerations = last["acceleration"]
+    numbers = {"energy_ratio": float(model[-1] / truth[-1]), "energy_ratio_no_force": float(truth[0] / truth[-1]),
+               "velocity_error": float(errors["velocity_error"][-1]), "early_time": early / run.turnover,
+               "early_velocity_error": early_error, "early_velocity_error_no_force": early_without}
     chosen = common.spread(SHOWN)
-    pdfs: dict[str, np.ndarray] = {"time": common.times[chosen]}
+    tables = {"errors": errors}
     for column, edges in EDGES.items():
         pairs = [run.pair(index, column) for index in chosen]
-        for of in BOTH:
-            pdfs[f"{column}_{of}"] = np.array([bin_probabilities(standardized(getattr(pair, of), pair.truth), edges)
-                                               for pair in pairs])
-        pdfs[f"{column}_kl"] = errors[f"{column}_kl"][chosen]
-    return {
-        "energy_ratio": float(model[-1] / truth[-1]), "energy_ratio_no_force": float(truth[0] / truth[-1]),
-        "velocity_error": float(errors["velocity_error"][-1]), "early_time": early / run.turnover,
-        "early_velocity_error": early_error, "early_velocity_error_no_force": early_without,
-        "velocity_kl": float(errors["velocity_kl"][-1]), "acceleration_kl": float(errors["acceleration_kl"][-1]),
-        **{f"{column}_kl_floor": against_truth.sampling_floor(pair, EDGES[column]) for column, pair in last.items()},
-        "acceleration_rms_ratio": float(np.std(accelerations.model) / np.std(accelerations.truth)),
-    }, {"errors": errors, "pdfs": pdfs}
+        tables[f"{column}_pdfs"] = {"time": common.times[chosen], **{of: np.array([
+            bin_probabilities(standardized(getattr(pair, of), pair.truth), edges) for pair in pairs]) for of in BOTH}}
+        numbers |= {f"{column}_kl": float(errors[f"{column}_kl"][-1]),
+                    f"{column}_kl_floor": against_truth.sampling_floor(pairs[-1], edges)}
+    return numbers | {"acceleration_rms_ratio": float(np.std(pairs[-1].model) / np.std(pairs[-1].truth))}, tables
 
 
 def _planes(run: Rollout) -> tuple[dict[str, Any], Tables]:
-    """Return planes in single precision, at up to PLANES times."""
+    """Return u_x, vorticity magnitude and kinetic energy in planes, in single precision, at up to PLANES times."""
     if run.planes is None:
         return {}, {}
     chosen = run.common.spread(PLANES)
-    columns: dict[str, list] = {f"{quantity}_{of}": [] for quantity in ("velocity", "vorticity") for of in BOTH}
+    planes: dict[str, list[np.ndarray]] = {}
     for index in chosen:
-        for of, plane in zip(BOTH, run.both(run.planes, index)):
-            columns[f"velocity_{of}"].append(plane.velocity)
-            columns[f"vorticity_{of}"].append(plane.vorticity)
-    model, truth = run.both(run.planes, int(chosen[-1]))
-    return {"plane_difference": normalized_l2(model.velocity[0], truth.velocity[0])}, {
+        both = run.both(run.planes, index)
+        for of, (velocity, vorticity) in zip(BOTH, both):
+            for name, values in (("u_x", velocity[0]), ("vorticity", vorticity),
+                                 ("energy", np.sum(velocity**2, axis=0) / 2)):
+                planes.setdefault(f"{name}_{of}", []).append(values)
+    return {"plane_difference": normalized_l2(*(velocity[0] for velocity, _ in both))}, {
         "planes": {"time": run.common.times[chosen],
-                   **{name: np.array(values, np.float32) for name, values in columns.items()}}}
+                   **{name: np.array(values, np.float32) for name, values in planes.items()}}}
 
 
 def _invariants(run: Rollout) -> tuple[dict[str, Any], Tables]:
-    """Return joint PDFs of the invariants Q and R at the last common time, and the mean rates of Q and R."""
+    """Return joint PDFs of the invariants Q and R at the last common time, and the mean rates of Q and R in cells with
+    at least FEWEST particles. The axes have the centres of the cells."""
     if run.invariants is None:
         return {"qr_kl": None, "qr_kl_floor": None}, {}
     found = against_truth.last_invariants(run)
-    tables: Tables = {"invariants": {"second": found.bins.second, "third": found.bins.third, "model": found.model,
-                                     "truth": found.truth}}
+    tables: Tables = {"invariants": {"second": bin_centres(found.bins.second), "third": bin_centres(found.bins.third),
+                                     **{of: found.bins.density(getattr(found, of)) for of in BOTH}}}
     if flows := against_truth.conditional_flows(run, found.bins):
-        tables["invariant_rates"] = {"second": flows[0].bins.second, "third": flows[0].bins.third, **{
-            f"{name}_{of}": getattr(flow, name) for of, flow in zip(BOTH, flows) for name in ConditionalVelocity.SUMS}}
+        bins = flows[0].bins
+        tables["invariant_rates"] = {"second": bin_centres(bins.second), "third": bin_centres(bins.third), **{
+            f"{name}_rate_{of}": rate for of, flow in zip(BOTH, flows)
+            for name, rate in zip(("second", "third"), flow.mean(FEWEST))}}
     return {"qr_kl": found.divergence, "qr_kl_floor": found.floor}, tables
 
 
 def _spectra(run: Rollout) -> tuple[dict[str, Any], Tables]:
     """Return spectra. Numbers are those of the last common time at which the spectrum of the flow is stored."""
-    cutoff, shown = run.filter_wavenumber, [run.spectra_at(index) for index in run.shown_spectra()]
-    last, times = shown[-1], np.array([at.time for at in shown])
-    nearest = [int(np.argmin(np.abs(run.flow["time"] - (run.start_time + time)))) for time in times]
-    tables = {"spectra": {"time": times, **{of: np.array([getattr(at, of) for at in shown]) for of in BOTH}},
-              "flow_spectra": {"time": times, "wavenumber": run.flow["wavenumber"],
-                               **{name: run.flow[name][nearest] for name in ("energy", "filtered")}}}
-    return {"filter_wavenumber": cutoff, "spectrum_error": last.error("model", cutoff),
-            "spectrum_error_floor": last.error("truth", cutoff), "band_energy_ratios": last.bands("model", cutoff),
-            "band_energy_ratios_floor": last.bands("truth", cutoff)}, tables
+    cutoff, shown = run.filter_wavenumber, run.shown_spectra()
+    found, times = [run.spectra_at(index) for index in shown], run.common.times[shown]
+    numbers: dict[str, Any] = {"filter_wavenumber": cutoff}
+    *both, filtered = found[-1]
+    for floor, energy in zip(("", "_floor"), both):
+        numbers |= {f"spectrum_error{floor}": spectrum_error(energy, filtered, cutoff),
+                    f"band_energy_ratios{floor}": band_ratios(energy, filtered, cutoff)}
+    rows = [run.flow_row(index) for index in shown]
+    return numbers, {
+        "spectra": {"time": times, **{f"energy_{of}": np.array(energy) for of, energy in zip(BOTH, zip(*found))}},
+        "flow_spectra": {"time": times, "wavenumber": run.flow["wavenumber"], "energy_flow": run.flow["energy"][rows],
+                         "energy_filtered": run.flow["filtered"][rows]}}
 
 
 def _paths(run: Rollout) -> tuple[dict[str, Any], Tables]:
     """Return Lagrangian statistics over all common frames."""
-    both = of_both(run)
-    return differences(*both), {f"paths_{of}": columns_of(paths) for of, paths in zip(BOTH, both)}
-
-
-def columns_of(paths: PathStatistics) -> Mapping[str, np.ndarray]:
-    return {each.name: np.asarray(getattr(paths, each.name)) for each in fields(paths)}
+    both, tables = of_both(run), {}
+    for of, paths in zip(BOTH, both):
+        columns = dict(vars(paths))
+        tables[f"increments_{of}"] = {"lag": columns.pop("lags"), **{name: columns.pop(name) for name in OVER_LAGS}}
+        tables[f"paths_{of}"] = {"time": columns.pop("times"), **columns}
+    return differences(*both), tables
 
 
 def _disorder(run: Rollout) -> tuple[dict[str, Any], Tables]:

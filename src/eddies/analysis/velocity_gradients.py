@@ -97,8 +97,6 @@ class ConditionalVelocity:
     The units of the two rates are <Q_w>^(3/2) and <Q_w>^2. Particles outside the bins are left out.
     """
 
-    SUMS = "count", "second_rate", "third_rate"  # arrays of the cells that determine the mean
-
     def __init__(self, bins: InvariantBins) -> None:
         self.bins = bins
         self.count, self.second_rate, self.third_rate = np.zeros((3, bins.second.size - 1, bins.third.size - 1))

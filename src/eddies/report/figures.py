@@ -6,6 +6,8 @@ import functools
 import io
 import itertools
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -17,6 +19,7 @@ from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullForma
 from matplotlib.transforms import Bbox
 
 Look = tuple[str, str]  # colour, marker
+Table = Mapping[str, np.ndarray]
 
 # The palette of Okabe and Ito, which colour-blind readers can distinguish. A quantity has one colour in all figures.
 DNS, FILTERED, TRUTH, MODEL = "#000000", "#7f7f7f", "#000000", "#D55E00"
@@ -42,8 +45,26 @@ LOOKS = {"paper": (MODEL, "o"), "resolved": (SECOND, "s"), "local": (THIRD, "D")
          "wcsph": (FOURTH, "^"), "transport-velocity": (FIFTH, "P"), "none": ("#b5a642", "X")}
 OTHERS = list(zip(("#7b3294", "#e7298a", "#66a61e", "#a6761d", "#1b9e77", "#666633"), ">p<d*8"))  # of other methods
 GRID, LIGHTEST = "h", 0.55  # marker of grids; share of white in the blue of the coarsest grid
+WIDE = {"color": TRUTH, "linewidth": 2.2}  # a line of the truth, which is seen beside and behind other lines
+ACROSS = 5  # entries in a line of a legend at the foot of a figure
 # The backend is left out: rc_context does not restore it, and a notebook would no longer show its figures.
 PLAIN = {key: value for key, value in matplotlib.rcParamsDefault.items() if key != "backend"}
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A variant in figures: its label, its colour and marker, and numbers and tables of it."""
+
+    label: str
+    look: Look
+    numbers: Mapping[str, Any]
+    tables: Mapping[str, Table]
+
+    def line(self, table: Table) -> dict[str, Any]:
+        """Return the style of a line through columns of a table, with about eight markers."""
+        points = max(np.shape(column)[-1] for column in table.values())
+        return {"color": self.look[0], "marker": self.look[1], "markersize": 4, "markevery": max(points // 8, 1),
+                "label": self.label}
 
 
 def styled(draw: Callable) -> Callable:
@@ -56,24 +77,23 @@ def styled(draw: Callable) -> Callable:
 
 
 def panels(rows: int, columns: int, size: tuple[float, float], right: float = 0.0, below: float = 0.0,
-           foot: float = 0.0, **sharing) -> tuple[Figure, np.ndarray]:
+           **sharing) -> tuple[Figure, np.ndarray]:
     """Return a figure and its axes (rows, columns), with fixed margins for labels and titles.
 
     All lengths are in inches. size: width and height of a panel with its labels. right: room for colour bars, beside
-    each panel or, with `sharey`, beside the last one. below: room for a legend below each panel. foot: room for a
-    legend below all panels. sharing: `sharex` and `sharey` of `Figure.subplots`.
+    each panel or, with `sharey`, beside the last one. below: room for a legend below each panel. sharing: `sharex` and
+    `sharey` of `Figure.subplots`.
     """
     width, height = size[0] * columns, size[1] * rows
-    figure = Figure(figsize=(width, height + foot))
+    figure = Figure(figsize=(width, height))
     across, up = RIGHT + right + LEFT, TOP + below + BOTTOM
     if sharing.get("sharey"):
         across = RIGHT + 0.08
     if sharing.get("sharex") is True:
         up = TOP + 0.05
-    left, upper, end, lower = LEFT, height + foot - TOP, width - RIGHT - right, foot + below + BOTTOM
+    left, upper, end, lower = LEFT, height - TOP, width - RIGHT - right, below + BOTTOM
     wide, high = (end - left - (columns - 1) * across) / columns, (upper - lower - (rows - 1) * up) / rows
-    figure.subplots_adjust(left / width, lower / (height + foot), end / width, upper / (height + foot), across / wide,
-                           up / high)
+    figure.subplots_adjust(left / width, lower / height, end / width, upper / height, across / wide, up / high)
     axes = figure.subplots(rows, columns, squeeze=False, **sharing)
     for panel in axes.flat:
         # The factor of the tick labels is written to the left of the title.
@@ -81,9 +101,14 @@ def panels(rows: int, columns: int, size: tuple[float, float], right: float = 0.
     return figure, axes
 
 
-def legend_at_foot(figure: Figure, axis: Axes, columns: int) -> None:
-    """Put the legend of a panel at the foot of the figure, where the argument `foot` of `panels` has left room."""
-    figure.legend(*axis.get_legend_handles_labels(), loc="lower center", ncols=columns, columnspacing=1.2)
+def legend_at_foot(figure: Figure, handles: Sequence[Any] | Axes) -> None:
+    """Put a legend below all panels, for which the figure becomes higher. Its entries are lines or those of a panel."""
+    handles = handles.get_legend_handles_labels()[0] if isinstance(handles, Axes) else handles
+    foot, (width, height), place = 0.1 + 0.2 * -(-len(handles) // ACROSS), figure.get_size_inches(), figure.subplotpars
+    figure.set_size_inches(width, height + foot)
+    figure.subplots_adjust(bottom=(place.bottom * height + foot) / (height + foot),
+                           top=(place.top * height + foot) / (height + foot))
+    figure.legend(handles=handles, loc="lower center", ncols=min(len(handles), ACROSS), columnspacing=1.2)
 
 
 def letter(axes: Sequence[Axes]) -> None:

@@ -6,11 +6,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from eddies.report.figures import (BAR, BLUE, DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SECOND, SIGNED,
-                                   colour_bar, guide_power_law, largest, legend_below, letter, mark_time, note,
+                                   Table, colour_bar, guide_power_law, largest, legend_below, letter, mark_time, note,
                                    number_wavenumbers, panels, show_plane, styled)
-from eddies.report.page import Metric, Section
-
-Table = Mapping[str, np.ndarray]
+from eddies.report.page import Section
 
 # Panels of the history: title, axis label, and the columns with their labels, colours and line styles.
 HISTORY = (
@@ -30,7 +28,7 @@ HISTORY = (
 )
 # The panel with a logarithmic axis, and the smallest value in it: smaller ones are only rounding errors.
 LOGARITHMIC, SMALLEST = "Compressibility", 1e-8
-METRICS = {
+LABELS = {
     "reynolds_lambda": "Taylor Reynolds number Re_λ", "kmax_eta": "resolution k_max η",
     "mach_turbulent": "turbulent Mach number M_t",
     "energy_budget_error": "relative error of the energy budget",
@@ -40,6 +38,8 @@ METRICS = {
     "density_rms": "density rms", "filter_width": "filter width d", "spacing": "mean particle spacing",
     "velocity_rms": "velocity rms of the tracers", "acceleration_rms": "acceleration rms of the tracers",
 }
+REASONS = {"mach_turbulent": "an incompressible fluid has none",
+           "kmax_eta": "nothing is dissipated, so there is no smallest scale to resolve"}
 
 
 def section(statistics: Table, spectra: Table, reference: Mapping[str, float], planes: Table,
@@ -61,13 +61,10 @@ def section(statistics: Table, spectra: Table, reference: Mapping[str, float], p
     at = {name: float(values[row]) for name, values in statistics.items()} | dict(reference)
     if eta == 0:
         at["kmax_eta"] = None
-    reasons = {"mach_turbulent": "an incompressible fluid has none",
-               "kmax_eta": "nothing is dissipated, so there is no smallest scale to resolve"}
     when = "at the end" if released is None else "at the release of the tracers"
     shown = Section(
         "ground_truth", "Ground truth", f"{source} Numbers {when}, t = {at['time']:.3g}.",
-        metrics=[Metric(key, label, at.get(key), reasons.get(key, ""))
-                 for key, label in METRICS.items() if key in at or key == "mach_turbulent"])
+        {key: at.get(key) for key in LABELS if key in at or key == "mach_turbulent"}, LABELS, REASONS)
     shown.add_figure(
         "statistics", "History of the simulation", lambda: statistics_history(statistics, released),
         f"From t = {times[0]:.3g} to {times[-1]:.3g}. Energy {when}: {at['energy']:.3g}; dissipation rate: "

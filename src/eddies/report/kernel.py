@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from eddies.report.figures import (BAR, DNS, MODEL, SECOND, SIGNED, THIRD, colour_bar, largest, letter, panels,
                                    show_plane, styled)
-from eddies.report.page import Metric, Section
+from eddies.report.page import Section
 
 KERNELS = {  # name in the files: label, colour, line style
     "learned": ("learned", MODEL, "-"),
@@ -78,15 +78,16 @@ def section(support: float, kernels: Mapping[str, np.ndarray], slices: Mapping[s
     support: support radius of the kernels. kernels, slices, errors: the tables with these names in kernel.h5. Errors
     are those on a field that the training has not used.
     """
-    def error(key: str, label: str, column: str) -> Metric:
-        return Metric(key, label, float(errors[column]) if column in errors else None, "this kernel was not compared")
-
-    metrics = [Metric("support", "support radius h", float(support)),
-               error("integral", "integral of the learned kernel", "integral_learned")]
-    metrics += [error(f"{start}{field}_error", f"error of the {field} field, {words}", f"{field}_error_{name}")
-                for name, (start, words) in ERRORS.items() for field in ("velocity", "gradient")]
+    numbers, labels = {"support": float(support), "integral": float(errors["integral_learned"])}, {
+        "support": "support radius h", "integral": "integral of the learned kernel"}
+    for name, (start, words) in ERRORS.items():
+        for field in ("velocity", "gradient"):
+            labels[f"{start}{field}_error"] = f"error of the {field} field, {words}"
+            column = f"{field}_error_{name}"
+            numbers[f"{start}{field}_error"] = float(errors[column]) if column in errors else None
     shown = Section("kernel", "Smoothing kernel", "Fields reconstructed from particles by each kernel, compared with "
-                    "the filtered field. Errors are normalised L2 errors over a whole unseen field.", metrics=metrics)
+                    "the filtered field. Errors are normalised L2 errors over a whole unseen field.", numbers, labels,
+                    dict.fromkeys(numbers, "this kernel was not compared"))
     shown.add_figure(
         "figure-1-kernels", "Kernels and their derivatives (the paper's Fig. 1)", lambda: shapes(kernels),
         f"Support h = {support:.3g}. The integral of the learned kernel is {errors['integral_learned']:.6f}.")

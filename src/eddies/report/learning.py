@@ -21,43 +21,26 @@ SMOOTHED = 0.04  # share of the steps of a phase over which a noisy curve is ave
 
 
 @styled
-def curves(history: Mapping[str, np.ndarray]) -> Figure:
-    """Draw losses and validation errors over the steps of a training. All phases are equally wide.
+def curves(histories: Mapping[str, tuple[Mapping[str, np.ndarray], str]]) -> Figure:
+    """Draw losses and validation errors over the steps of trainings, which are given with their colours by label. All
+    phases are equally wide.
 
-    history: columns (steps,). A loss that is not used in a step is NaN; a loss that is never used has no column.
+    A history has columns (steps,). A loss that is not used in a step is NaN; a loss that is never used has no column.
+    One training has all its losses, each in a colour. Several have their total losses.
     """
-    history = _placed(history)
-    figure, axes = panels(1, 2, (5.3, 3.2), below=0.15, foot=0.5)
-    losses, errors = axes[0]
-    for name, label, colour in LOSSES:
-        if name in history and np.any(history[name] > 0):
-            _noisy(losses, history, name, colour, label)
-    losses.set(title="Losses", ylabel="loss", yscale="log")
-    _validation(errors, history)
-    for axis in axes.flat:
-        _mark_phases(axis, history)
-    legend_at_foot(figure, losses, 4)
-    letter(axes.flat)
-    return figure
-
-
-@styled
-def curves_of_several(histories: Mapping[str, tuple[Mapping[str, np.ndarray], str]]) -> Figure:
-    """Draw total losses and validation errors of several trainings over the share of the steps, all phases equally
-    wide. The histories and their colours are given by label."""
-    figure, ((losses, errors),) = panels(1, 2, (5.3, 3.2), foot=0.1 + 0.2 * -(-len(histories) // 5))
+    alone, x = len(histories) == 1, "phases of the training"
+    figure, ((losses, errors),) = panels(1, 2, (5.3, 3.2), below=0.15 * alone)
     for label, (history, colour) in histories.items():
         history = _placed(history)
-        history["place"] = history["place"] / history["place"][-1]
-        _noisy(losses, history, "loss", colour, label)
-        error = history.get("validation_error", np.full(len(history["step"]), np.nan))
-        for number in np.unique(history["phase"]):
-            chosen = (history["phase"] == number) & np.isfinite(error)
-            errors.plot(history["place"][chosen], error[chosen], color=colour, marker="o", markersize=3)
-    losses.set(title="Losses", ylabel="total loss", yscale="log", xlabel="share of the training, phases equally wide")
-    errors.set(title="Validation error", ylabel="validation error", ylim=(0, None),
-               xlabel="share of the training, phases equally wide")
-    legend_at_foot(figure, losses, 5)
+        for name, words, own in LOSSES if alone else (("loss", label, colour),):
+            if name in history and np.any(history[name] > 0):
+                _noisy(losses, history, name, own, words)
+        _validation(errors, history, colour)
+    losses.set(title="Losses", ylabel="loss" if alone else "total loss", yscale="log", xlabel=x)
+    errors.set(title="Validation error, minima circled", ylabel="validation error", ylim=(0, None), xlabel=x)
+    for axis in (losses, errors) if alone else ():
+        _mark_phases(axis, history)
+    legend_at_foot(figure, losses)
     letter((losses, errors))
     return figure
 
@@ -82,14 +65,13 @@ def _mark_phases(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
     axis.set_xlabel("steps and wall time")
 
 
-def _validation(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
+def _validation(axis: Axes, history: Mapping[str, np.ndarray], colour: str) -> None:
     """Draw a line of validation errors for each phase, and a circle at the minimum of each line.
 
     Phases have separate lines because they measure errors in different ways. A line begins with the error before the
     first step of the phase.
     """
-    axis.set(title="Validation error, minima circled", ylabel="validation error")
-    missing, highest = np.full(len(history["step"]), np.nan), 0.0
+    missing = np.full(len(history["step"]), np.nan)
     after, before = (history.get(name, missing) for name in ("validation_error", "start_error"))
     for index, number in enumerate(np.unique(history["phase"])):
         chosen = history["phase"] == number
@@ -97,11 +79,8 @@ def _validation(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
         error = np.append(before[chosen][0], after[chosen])
         place, error = place[np.isfinite(error)], error[np.isfinite(error)]
         if len(error):
-            best, highest = np.argmin(error), max(highest, error.max())
-            axis.plot(place, error, color=MODEL, marker="o", markersize=3)
-            axis.plot(place[best], error[best], marker="o", markersize=8, markerfacecolor="none", color=DNS)
-    if highest > 0:
-        axis.set_ylim(0, 1.1 * highest)
+            axis.plot(place, error, color=colour, marker="o", markersize=3)
+            axis.plot(place[np.argmin(error)], error.min(), marker="o", markersize=8, markerfacecolor="none", color=DNS)
 
 
 def _noisy(axis: Axes, history: Mapping[str, np.ndarray], name: str, colour: str, label: str) -> None:

@@ -1,10 +1,9 @@
 """Figures of rollouts beside the true tracers: the paper's Figs. 4 to 9, Lagrangian statistics, disorder.
 
-Each function draws the measures of several variants, by name, and their common truth.
+Each function draws the measures of several variants and their common truth, which it takes from the first variant.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,40 +14,30 @@ from matplotlib.figure import Figure
 from eddies.analysis import disorder
 from eddies.analysis.against_truth import EDGES
 from eddies.analysis.pdfs import bin_centres, gaussian
-from eddies.analysis.velocity_gradients import ConditionalVelocity, InvariantBins, vieillefosse_line
+from eddies.analysis.velocity_gradients import vieillefosse_line
 from eddies.clock import SAME
-from eddies.report.figures import (BAR, DNS, FILTERED, GUIDE, MODEL, POSITIVE, SIGNED, TRUTH, Look, colour_bar,
-                                   guide_power_law, largest, legend_at_foot, letter, note, number_wavenumbers, panels,
-                                   plain_log_ticks, show_plane, styled)
+from eddies.report.figures import (BAR, DNS, FILTERED, GUIDE, MODEL, POSITIVE, SIGNED, TRUTH, WIDE, Table, Variant,
+                                   colour_bar, guide_power_law, largest, legend_at_foot, letter, note,
+                                   number_wavenumbers, panels, plain_log_ticks, show_plane, styled)
 
-FEWEST = 8  # smallest number of particles in a cell of the Q-R plane for which its mean motion is drawn
-WIDE = {"color": TRUTH, "linewidth": 2.2}  # a line of the truth, which is seen beside and behind other lines
 TRUE = "true tracers"
-Table = Mapping[str, np.ndarray]
+Variants = Sequence[Variant]
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """A variant in the figures: its label, its colour and marker, and the numbers and tables of its measures."""
-
-    label: str
-    look: Look
-    numbers: Mapping[str, Any]
-    tables: Mapping[str, Table]
-
-    @property
-    def turnover(self) -> float:
-        """Eddy turnover time T."""
-        return float(self.numbers["attributes"]["eddy_turnover_time"])
-
-    def line(self, times: int = 0) -> dict[str, Any]:
-        """Return the style of a line through values at `times` times, with about eight markers."""
-        colour, marker = self.look
-        return {"color": colour, "marker": marker, "markersize": 4, "markevery": max(times // 8, 1),
-                "label": self.label}
+def turnover_of(variants: Variants) -> float:
+    """Return the eddy turnover time T, the unit of time in the figures."""
+    return float(variants[0].numbers["attributes"]["eddy_turnover_time"])
 
 
-Variants = Mapping[str, Drawn]
+def of_all(variants: Variants, *names: str) -> Iterator[tuple[list[Table], str, dict[str, Any]]]:
+    """Yield tables, "truth" or "model", and the style of a line: first of the truth, then of each variant.
+
+    In the names of the tables, {} stands for "truth" or "model".
+    """
+    yield [variants[0].tables[name.format("truth")] for name in names], "truth", {**WIDE, "label": TRUE}
+    for each in variants:
+        tables = [each.tables[name.format("model")] for name in names]
+        yield tables, "model", each.line(tables[0])
 
 
 def row_at(table: Table, time: float) -> int | None:
@@ -58,39 +47,27 @@ def row_at(table: Table, time: float) -> int | None:
     return row if abs(times[row] - time) <= SAME * max(times.max(), abs(time), 1e-300) else None
 
 
-def _legend_columns(variants: Variants, more: int) -> int:
-    return min(len(variants) + more, 5)
-
-
-def _foot(entries: int) -> float:
-    """Return the height in inches of a legend with `entries` entries, five in a line."""
-    return 0.1 + 0.2 * -(-entries // 5)
-
-
 @styled
 def velocity_planes(variants: Variants) -> Figure:
     """Draw u_x in planes [y, x], with a row of panels for the truth and for each variant, and a column for each time.
 
     The planes of the truth determine the colour scale. A panel without a frame of the variant is empty.
     """
-    first = next(iter(variants.values()))
-    truth, turnover = first.tables["planes"], first.turnover
+    truth = variants[0].tables["planes"]
     high, wide = 1 + len(variants), len(truth["time"])
     figure, axes = panels(high, wide, ((2.3 * wide + 1.46) / wide, (2.1 * high + 1.15) / high), right=BAR, sharex=True,
                           sharey=True)
-    limit = largest(*(plane[0] for plane in truth["velocity_truth"]))
-    rows = [(TRUE, truth, "velocity_truth")]
-    rows += [(each.label, each.tables["planes"], "velocity_model") for each in variants.values()]
-    for row, (name, table, column) in zip(axes, rows):
+    limit = largest(*truth["u_x_truth"])
+    for row, ((table,), of, line) in zip(axes, of_all(variants, "planes")):
         for axis, time in zip(row, truth["time"]):
             if (at := row_at(table, time)) is not None:
-                image = show_plane(axis, table[column][at][0], (-limit, limit), SIGNED)
+                image = show_plane(axis, table[f"u_x_{of}"][at], (-limit, limit), SIGNED)
             else:
                 axis.set_aspect("equal")
                 note(axis, "no frame", (0.5, 0.5), "axes fraction", (0, 0), ha="center")
-        row[0].set_ylabel(f"{name}\n$y$")
+        row[0].set_ylabel(f"{line['label']}\n$y$")
     for top, last, time in zip(axes[0], axes[-1], truth["time"]):
-        top.set_title(f"$t = {time / turnover:.2f}\\,T$")
+        top.set_title(f"$t = {time / turnover_of(variants):.2f}\\,T$")
         last.set_xlabel("$x$")
     colour_bar(figure, image, axes.flat, "$u_x$")
     return figure
@@ -100,52 +77,40 @@ def velocity_planes(variants: Variants) -> Figure:
 def vorticity_and_energy(variants: Variants) -> Figure:
     """Draw planes [y, x] of the vorticity magnitude, and below them of the kinetic energy, at the last time of each
     variant. The truth has the first column of panels, and determines the colour scales."""
-    first = next(iter(variants.values())).tables["planes"]
-    columns = {TRUE: (first["vorticity_truth"][-1], first["velocity_truth"][-1])}
-    columns |= {each.label: (each.tables["planes"]["vorticity_model"][-1], each.tables["planes"]["velocity_model"][-1])
-                for each in variants.values()}
-    figure, axes = panels(2, len(columns), (2.1 + 2.1 / len(columns), 2.9), right=BAR, sharex=True, sharey=True)
-    vorticity, energy = zip(*((strength, kinetic_energy(velocity)) for strength, velocity in columns.values()))
-    for row, label, planes in zip(axes, (r"$|\omega|$", r"$\frac{1}{2}|u|^2$"), (vorticity, energy)):
-        for axis, values in zip(row, planes):
-            image = show_plane(axis, values, (0, largest(planes[0])), POSITIVE)
+    wide = 1 + len(variants)
+    figure, axes = panels(2, wide, (2.1 + 2.1 / wide, 2.9), right=BAR, sharex=True, sharey=True)
+    for row, label, column in zip(axes, (r"$|\omega|$", r"$\frac{1}{2}|u|^2$"), ("vorticity", "energy")):
+        limit = largest(variants[0].tables["planes"][f"{column}_truth"][-1])
+        for axis, ((table,), of, line) in zip(row, of_all(variants, "planes")):
+            image = show_plane(axis, table[f"{column}_{of}"][-1], (0, limit), POSITIVE)
+            if column == "vorticity":
+                axis.set_title(line["label"])
+            else:
+                axis.set_xlabel("$x$")
         colour_bar(figure, image, row, label, extend="max")
         row[0].set_ylabel("$y$")
-    for top, last, name in zip(*axes, columns):
-        top.set_title(name)
-        last.set_xlabel("$x$")
     return figure
-
-
-def kinetic_energy(velocity: np.ndarray) -> np.ndarray:
-    """Return |u|^2 / 2 of a velocity (3, y, x), as an array [y, x]."""
-    return np.sum(velocity**2, axis=0) / 2
 
 
 @styled
 def errors_over_time(variants: Variants) -> Figure:
     """Draw velocity error, energy, density rms if there is a density, and divergences of PDFs over time."""
-    first = next(iter(variants.values()))
-    truth, turnover = first.tables["truth"], first.turnover
-    figure, axes = panels(2, 3, (3.6, 2.7), foot=_foot(len(variants) + 2))
+    truth, turnover = variants[0].tables["truth"], turnover_of(variants)
+    figure, axes = panels(2, 3, (3.6, 2.7))
     error, energy, density, velocity, acceleration, unused = axes.flat
-    end = max(each.tables["errors"]["time"][-1] for each in variants.values())
-    seen = truth["time"] <= end * (1 + SAME)
-    energy.plot(truth["time"][seen] / turnover, truth["energy"][seen] / truth["energy"][0], **WIDE)
-    if "density_rms" in truth:
-        density.plot(truth["time"][seen] / turnover, truth["density_rms"][seen], **WIDE)
-    error.plot([], [], **WIDE, label=TRUE)
-    for each in variants.values():
-        model, errors = each.tables["model"], each.tables["errors"]
-        time, at = errors["time"] / turnover, model["time"] / turnover
-        error.plot(time, errors["velocity_error"], **each.line(len(time)))
-        energy.plot(at, model["energy"] / truth["energy"][0], **each.line(len(at)))
-        if "density_rms" in model and density.lines:
-            density.plot(at, model["density_rms"], **each.line(len(at)))
-        for axis, column in ((velocity, "velocity_kl"), (acceleration, "acceleration_kl")):
-            axis.plot(time, errors[column], **each.line(len(time)))
-    longest = max((each.tables["errors"] for each in variants.values()), key=lambda errors: errors["time"][-1])
-    error.plot(longest["time"] / turnover, longest["no_force"], color=GUIDE, linestyle="--", label="no force, exact")
+    longest = max((each.tables["errors"] for each in variants), key=lambda errors: errors["time"][-1])
+    end = longest["time"][-1]
+    for (series,), of, line in of_all(variants, "{}"):
+        shown = series["time"] <= (end * (1 + SAME) if of == "truth" else np.inf)
+        energy.plot(series["time"][shown] / turnover, series["energy"][shown] / truth["energy"][0], **line)
+        if "density_rms" in series and "density_rms" in truth:
+            density.plot(series["time"][shown] / turnover, series["density_rms"][shown], **line)
+    for each in variants:
+        errors = each.tables["errors"]
+        for axis, column in ((error, "velocity_error"), (velocity, "velocity_kl"), (acceleration, "acceleration_kl")):
+            axis.plot(errors["time"] / turnover, errors[column], **each.line(errors))
+    energy.plot([], [], color=GUIDE, linestyle="--", label="no force, exact")
+    error.plot(longest["time"] / turnover, longest["no_force"], color=GUIDE, linestyle="--")
     error.axhline(1, color=GUIDE, linestyle=":", linewidth=1.2)
     error.set(title="Velocity error", ylabel="normalised L2 by particle", ylim=(0, None))
     energy.set(title="Kinetic energy", ylabel="$E(t)/E(0)$", ylim=(0, None))
@@ -157,7 +122,7 @@ def errors_over_time(variants: Variants) -> Figure:
         density.remove()
     for axis in figure.axes:
         axis.set(xlabel="time $t/T$", xlim=(0, end / turnover or None))  # a single frame is at time 0
-    legend_at_foot(figure, error, _legend_columns(variants, 2))
+    legend_at_foot(figure, energy)
     letter(figure.axes)
     return figure
 
@@ -165,25 +130,22 @@ def errors_over_time(variants: Variants) -> Figure:
 @styled
 def particle_pdfs(variants: Variants) -> Figure:
     """Draw the PDFs of velocity and acceleration at several times. All three components count in one PDF."""
-    first = next(iter(variants.values()))
-    truth = first.tables["pdfs"]
-    figure, axes = panels(2, len(truth["time"]), (3.5, 2.7), foot=_foot(len(variants) + 2), sharex="row", sharey="row")
+    times = variants[0].tables["velocity_pdfs"]["time"]
+    figure, axes = panels(2, len(times), (3.5, 2.7), sharex="row", sharey="row")
     for row, (quantity, edges) in zip(axes, EDGES.items()):
         centres, width = bin_centres(edges), np.diff(edges)
-        for axis, time in zip(row, truth["time"]):
+        for axis, time in zip(row, times):
             axis.semilogy(centres, gaussian(centres), color=GUIDE, linestyle=":", label="Gaussian")
-            lines = [(truth, f"{quantity}_truth", {**WIDE, "label": TRUE})]
-            lines += [(each.tables["pdfs"], f"{quantity}_model", each.line(len(centres))) for each in variants.values()]
-            for table, column, line in lines:
+            for (table,), of, line in of_all(variants, f"{quantity}_pdfs"):
                 if (at := row_at(table, time)) is not None:
-                    density = table[column][at] / width
+                    density = table[of][at] / width
                     axis.semilogy(centres, np.where(density > 0, density, np.nan), **{"linewidth": 1.2, **line})
-            axis.set_title(f"$t = {time / first.turnover:.2f}\\,T$")
+            axis.set_title(f"$t = {time / turnover_of(variants):.2f}\\,T$")
             axis.set_xlabel(f"${quantity[0]}$ / standard deviation of the truth")
-        probabilities = truth[f"{quantity}_truth"]
+        probabilities = variants[0].tables[f"{quantity}_pdfs"]["truth"]
         row[0].set_ylim(0.4 * (probabilities[probabilities > 0].min() / width[0]), 2)
         row[0].set_ylabel(f"{quantity} PDF")
-    legend_at_foot(figure, axes[0, 0], _legend_columns(variants, 2))
+    legend_at_foot(figure, axes[0, 0])
     letter(axes.flat)
     return figure
 
@@ -192,34 +154,33 @@ def particle_pdfs(variants: Variants) -> Figure:
 def energy_spectra(variants: Variants) -> Figure:
     """Draw spectra of the variants and the true tracers at several times, each with the DNS spectra of the nearest
     stored time."""
-    first = next(iter(variants.values()))
-    truth, flow, cutoff = first.tables["spectra"], first.tables["flow_spectra"], first.numbers["rollout"][
-        "filter_wavenumber"]
-    times = truth["time"]
-    figure, axes = panels(1, len(times), (3.5, 3.4) if len(times) > 1 else (5.6, 3.8), foot=_foot(len(variants) + 3),
-                          sharex=True, sharey=True)
-    known, shells = flow["wavenumber"] >= 1, np.arange(1, truth["truth"].shape[1])
+    truth, flow = variants[0].tables["spectra"], variants[0].tables["flow_spectra"]
+    cutoff, times, known = np.pi / variants[0].numbers["filter_width"], truth["time"], flow["wavenumber"] >= 1
+    figure, axes = panels(1, len(times), (3.5, 3.4) if len(times) > 1 else (5.6, 3.8), sharex=True, sharey=True)
     for number, (axis, time) in enumerate(zip(axes.flat, times)):
-        axis.loglog(flow["wavenumber"][known], flow["energy"][number][known], color=DNS, linewidth=1, linestyle=":",
-                    label="DNS")
-        axis.loglog(flow["wavenumber"][known], flow["filtered"][number][known], color=FILTERED, linestyle="--",
-                    linewidth=1.3, label="filtered DNS")
-        axis.loglog(shells, truth["truth"][number][1:], **WIDE, label=TRUE)
-        for each in variants.values():
-            table = each.tables["spectra"]
+        for column, line in (("energy_flow", {"color": DNS, "linewidth": 1, "linestyle": ":", "label": "DNS"}),
+                             ("energy_filtered", {"color": FILTERED, "linewidth": 1.3, "linestyle": "--",
+                                                  "label": "filtered DNS"})):
+            axis.loglog(flow["wavenumber"][known], flow[column][number][known], **line)
+        for (table,), of, line in of_all(variants, "spectra"):
             if (at := row_at(table, time)) is not None:
-                energy = table["model"][at][1:]
-                axis.loglog(np.arange(1, len(energy) + 1), energy, **{**each.line(), "linewidth": 1.1})
-        axis.axvline(cutoff, color=GUIDE, linestyle=":", linewidth=1)
-        note(axis, r"$\pi/d$", (cutoff, 0.01), ("data", "axes fraction"), (3, 1))
-        axis.set(title=f"$t = {time / first.turnover:.2f}\\,T$", xlabel="wavenumber $k$")
+                energy = table[f"energy_{of}"][at][1:]
+                axis.loglog(np.arange(1, len(energy) + 1), energy, **{"linewidth": 1.1, **line})
+        mark_cutoff(axis, cutoff)
+        axis.set(title=f"$t = {time / turnover_of(variants):.2f}\\,T$", xlabel="wavenumber $k$")
         number_wavenumbers(axis)
-    peak, top = truth["truth"][:, 1:].max(), 1.5 * truth["truth"].shape[1]
+    peak, top = truth["energy_truth"][:, 1:].max(), 1.5 * truth["energy_truth"].shape[1]
     guide_power_law(axes[0, 0], (2, min(10, 0.7 * top)), 2.2 * peak, -5 / 3, r"$k^{-5/3}$")
     axes[0, 0].set(ylabel="$E(k)$", ylim=(1e-6 * peak, 6 * peak), xlim=(0.9, max(top, 2)))
-    legend_at_foot(figure, axes[0, 0], _legend_columns(variants, 3))
+    legend_at_foot(figure, axes[0, 0])
     letter(axes.flat)
     return figure
+
+
+def mark_cutoff(axis: Axes, cutoff: float) -> None:
+    """Draw a vertical line at the filter wavenumber."""
+    axis.axvline(cutoff, color=GUIDE, linestyle=":", linewidth=1)
+    note(axis, r"$\pi/d$", (cutoff, 0.01), ("data", "axes fraction"), (3, 1))
 
 
 @styled
@@ -227,20 +188,16 @@ def path_statistics(variants: Variants) -> Figure:
     """Draw statistics of velocity and acceleration along paths, pair dispersion, and the size and shape of tetrads."""
     figure, axes = panels(3, 3, (3.6, 2.6))
     (memory, structure, accelerations), (variance, flatness, pairs), (sizes, shapes, unused) = axes
-    first = next(iter(variants.values()))
-    lines = [(first.tables["paths_truth"], {**WIDE, "label": TRUE})]
-    lines += [(each.tables["paths_model"], each.line(len(each.tables["paths_model"]["times"])))
-              for each in variants.values()]
-    for run, line in lines:
-        time, lags = run["times"] / first.turnover, run["lags"] / first.turnover
-        memory.plot(time, run["velocity_correlation"], **line)
-        structure.loglog(lags, run["structure"], **line)
-        accelerations.plot(lags, run["acceleration_correlation"], **line)
-        variance.plot(time, run["acceleration_variance"], **line)
-        flatness.semilogx(lags, run["flatness"], **line)
-        pairs.loglog(time[1:], run["pair_dispersion"][1:], **line)
-        sizes.plot(time, run["tetrad_size"], **line)
-        for eigenvalue in run["tetrad_shape"].T:
+    for (paths, increments), _, line in of_all(variants, "paths_{}", "increments_{}"):
+        time, lags = paths["time"] / turnover_of(variants), increments["lag"] / turnover_of(variants)
+        memory.plot(time, paths["velocity_correlation"], **line)
+        structure.loglog(lags, increments["structure"], **line)
+        accelerations.plot(lags, increments["acceleration_correlation"], **line)
+        variance.plot(time, paths["acceleration_variance"], **line)
+        flatness.semilogx(lags, increments["flatness"], **line)
+        pairs.loglog(time[1:], paths["pair_dispersion"][1:], **line)
+        sizes.plot(time, paths["tetrad_size"], **line)
+        for eigenvalue in paths["tetrad_shape"].T:
             shapes.plot(time, eigenvalue, **line)
     memory.set(title="Velocity correlation", ylabel=r"$\rho_v(t)$")
     structure.set(title="Structure function", ylabel=r"$\langle(\Delta_\tau v_i)^2\rangle$")
@@ -268,20 +225,17 @@ def path_statistics(variants: Variants) -> Figure:
 @styled
 def particle_disorder(variants: Variants) -> Figure:
     """Draw the PDF of nearest-neighbour distances, and the variance of particle counts over time."""
-    figure, ((nearest, variance),) = panels(1, 2, (4.4, 3.1), foot=_foot(len(variants) + 2))
-    edges, first = disorder.DISTANCE_EDGES, next(iter(variants.values()))
+    figure, ((nearest, variance),) = panels(1, 2, (4.4, 3.1))
+    edges = disorder.DISTANCE_EDGES
     fine, centres = np.linspace(edges[0], edges[-1], 300), bin_centres(edges)
     nearest.plot(fine, disorder.random_distance_density(fine), color=GUIDE, linestyle=":", label="random points")
-    lines = [(first.tables["distances"]["truth"], first.tables["truth"], {**WIDE, "label": TRUE})]
-    lines += [(each.tables["distances"]["model"], each.tables["model"], each.line(len(centres)))
-              for each in variants.values()]
-    for distances, series, line in lines:
-        nearest.plot(centres, distances / np.diff(edges), **line)
-        variance.plot(series["time"] / first.turnover, series["count_variance"], **{**line, "markevery": 1})
+    for (distances, series), of, line in of_all(variants, "distances", "{}"):
+        nearest.plot(centres, distances[of] / np.diff(edges), **line)
+        variance.plot(series["time"] / turnover_of(variants), series["count_variance"], **line)
     nearest.set(title="Nearest neighbour", xlabel="distance / mean spacing", ylabel="PDF", ylim=(0, None))
     variance.axhline(1, color=GUIDE, linestyle=":")
     variance.set(title="Variance of counts", ylabel="relative to random points", xlabel="time $t/T$", ylim=(0, None))
-    legend_at_foot(figure, nearest, _legend_columns(variants, 2))
+    legend_at_foot(figure, nearest)
     letter((nearest, variance))
     return figure
 
@@ -294,36 +248,33 @@ def invariant_planes(variants: Variants) -> Figure:
     The mean is drawn as an arrow, whose colour shows the magnitude. For the direction of the arrow, each rate is
     divided by the range of its axis. For the magnitude, each rate is in its own unit, which is a power of <Q_w>.
     """
-    first = next(iter(variants.values())).tables
-    bins = InvariantBins(first["invariants"]["second"], first["invariants"]["third"])
-    columns = {TRUE: (first, "truth"), **{each.label: (each.tables, "model") for each in variants.values()}}
-    moving = all("invariant_rates" in tables for tables, _ in columns.values())
-    figure, axes = panels(1 + moving, len(columns), (2.5 + 2.4 / len(columns), 3.0), right=BAR + 0.1, sharex=True,
-                          sharey=True)
-    across, up = bin_centres(bins.third)[-2], bin_centres(bins.second)[-2]
-    truth = bins.density(first["invariants"]["truth"])
+    first = variants[0].tables["invariants"]
+    moving = all("invariant_rates" in each.tables for each in variants)
+    wide = 1 + len(variants)
+    figure, axes = panels(1 + moving, wide, (2.5 + 2.4 / wide, 3.0), right=BAR + 0.1, sharex=True, sharey=True)
+    across, up = first["third"][-2], first["second"][-2]
     # Two to eight contour levels, half a decade apart. The highest is just below the peak of the truth. If there are
     # more than two, the lowest is above the density of one particle.
-    peak, single = (np.log10(extreme) for extreme in (truth.max(), truth[truth > 0].min()))
+    peak, single = (np.log10(extreme) for extreme in (first["truth"].max(), first["truth"][first["truth"] > 0].min()))
     top = np.floor(2 * peak)
     levels = 10.0 ** (np.arange(top, min(2 * single, top - 1.5), -1)[:8][::-1] / 2)
-    for axis, (name, (tables, of)) in zip(axes[0], columns.items()):
-        # Each variant has its own bins, because its last time may be another one. Outer cells are not drawn, because
+    for axis, ((table,), of, line) in zip(axes[0], of_all(variants, "invariants")):
+        # Each variant has its own cells, because its last time may be another one. Outer cells are not drawn, because
         # they also count all values beyond them. Empty cells get a value above 0.
-        own = InvariantBins(tables["invariants"]["second"], tables["invariants"]["third"])
-        shown = np.maximum(own.density(tables["invariants"][of])[1:-1, 1:-1], 1e-3 * levels[0])
-        filled = axis.contourf(bin_centres(own.third)[1:-1], bin_centres(own.second)[1:-1], shown, levels,
-                               cmap="YlGnBu", norm=LogNorm(levels[0], levels[-1]), extend="max")
-        axis.set_title(name)
+        filled = axis.contourf(table["third"][1:-1], table["second"][1:-1],
+                               np.maximum(table[of][1:-1, 1:-1], 1e-3 * levels[0]), levels, cmap="YlGnBu",
+                               norm=LogNorm(levels[0], levels[-1]), extend="max")
+        axis.set_title(line["label"])
     bar = colour_bar(figure, filled, axes[0], "joint PDF", extend="neither")
     bar.set_ticks(levels[::2], labels=[f"{level:.0e}" for level in levels[::2]])
     if moving:
-        flows = [rates(tables["invariant_rates"], of) for tables, of in columns.values()]
-        speeds = np.concatenate([np.hypot(*flow.mean(FEWEST)).ravel() for flow in flows])
+        flows = [(table, of) for (table,), of, _ in of_all(variants, "invariant_rates")]
+        speeds = np.concatenate([np.hypot(table[f"second_rate_{of}"], table[f"third_rate_{of}"]).ravel()
+                                 for table, of in flows])
         speeds = speeds[speeds > 0]
         norm = LogNorm(*np.quantile(speeds, (0.02, 0.98))) if speeds.size else None
         for axis, flow in zip(axes[1], flows):
-            arrows = _draw_arrows(axis, flow, norm, 0.97 * across, 0.97 * up)
+            arrows = _draw_arrows(axis, *flow, norm, 0.97 * across, 0.97 * up)
         bar = colour_bar(figure, arrows, axes[1], "speed of the mean motion")
         plain_log_ticks(bar.ax.yaxis)
     third = np.linspace(-across, across, 401)
@@ -339,23 +290,15 @@ def invariant_planes(variants: Variants) -> Figure:
     return figure
 
 
-def rates(table: Table, of: str) -> ConditionalVelocity:
-    """Return the mean motion in the Q-R plane of "model" or "truth" from its table."""
-    found = ConditionalVelocity(InvariantBins(table["second"], table["third"]))
-    for name in ConditionalVelocity.SUMS:
-        setattr(found, name, table[f"{name}_{of}"])
-    return found
-
-
-def _draw_arrows(axis: Axes, flow: ConditionalVelocity, norm: LogNorm | None, third_limit: float, second_limit: float):
+def _draw_arrows(axis: Axes, table: Table, of: str, norm: LogNorm | None, third_limit: float, second_limit: float):
     """Draw arrows of equal length at the cells with |R| < `third_limit` and |Q| < `second_limit`, and return them.
 
     With these limits no arrow leaves the panel.
     """
-    third, second = np.meshgrid(bin_centres(flow.bins.third), bin_centres(flow.bins.second))
+    third, second = np.meshgrid(table["third"], table["second"])
     inside = (np.abs(third) < third_limit) & (np.abs(second) < second_limit)
-    second_rate, third_rate = (rate[inside] for rate in flow.mean(FEWEST))
-    across, up = third_rate / np.ptp(flow.bins.third), second_rate / np.ptp(flow.bins.second)
+    second_rate, third_rate = (table[f"{name}_rate_{of}"][inside] for name in ("second", "third"))
+    across, up = third_rate / np.ptp(third), second_rate / np.ptp(second)
     length = np.hypot(across, up)
     length[length == 0] = np.nan
     return axis.quiver(third[inside], second[inside], across / length, up / length, np.hypot(second_rate, third_rate),
@@ -365,34 +308,32 @@ def _draw_arrows(axis: Axes, flow: ConditionalVelocity, norm: LogNorm | None, th
 @styled
 def forced_rollouts(variants: Variants) -> Figure:
     """Draw energy over time, mean spectra and acceleration PDFs of forced rollouts and of the stationary flow."""
-    first = next(iter(variants.values()))
-    flow = first.numbers["forced"]["energy"]
+    flow, truth = variants[0].numbers["forced"]["energy"], variants[0].tables["forced_spectra"]
     mean, deviation = flow["stationary flow"], flow["its deviation"]
-    cutoff, truth = np.pi / first.numbers["filter_width"], first.tables["forced_spectra"]
-    figure, ((energy, spectrum, density),) = panels(1, 3, (3.6, 3.1), foot=_foot(len(variants) + 2))
+    cutoff = np.pi / variants[0].numbers["filter_width"]
+    figure, ((energy, spectrum, density),) = panels(1, 3, (3.6, 3.1))
     energy.axhspan(mean - deviation, mean + deviation, color=TRUTH, alpha=0.15, linewidth=0)
     energy.axhline(mean, **WIDE, label="stationary flow")
-    spectrum.loglog(truth["wavenumber"], truth["flow"], **WIDE)
-    edges = EDGES["acceleration"]
-    middle, width, highest = bin_centres(edges), np.diff(edges), mean + deviation
-    density.semilogy(middle, gaussian(middle), color=GUIDE, linestyle="--", linewidth=1.1)
     energy.plot([], [], color=GUIDE, linestyle="--", label="Gaussian")
-    true = first.tables["forced_accelerations"]["truth"] / width
-    density.plot(middle[true > 0], true[true > 0], **WIDE)
-    for each in variants.values():
+    spectrum.loglog(truth["wavenumber"], truth["energy_flow"], **WIDE)
+    edges = EDGES["acceleration"]
+    middle, highest = bin_centres(edges), mean + deviation
+    density.semilogy(middle, gaussian(middle), color=GUIDE, linestyle="--", linewidth=1.1)
+    for (accelerations,), of, line in of_all(variants, "forced_accelerations"):
+        found = accelerations[of] / np.diff(edges)
+        density.plot(middle[found > 0], found[found > 0], **line)
+    for each in variants:
         model, spectra = each.tables["model"], each.tables["forced_spectra"]
-        energy.plot(model["time"] / each.turnover, model["energy"], **each.line(len(model["time"])))
-        spectrum.loglog(spectra["wavenumber"], spectra["model"], **each.line())
-        found = each.tables["forced_accelerations"]["model"] / width
-        density.plot(middle[found > 0], found[found > 0], **each.line(len(middle)))
+        energy.plot(model["time"] / turnover_of(variants), model["energy"], **each.line(model))
+        spectrum.loglog(spectra["wavenumber"], spectra["energy_model"], **each.line(spectra))
         highest = max(highest, model["energy"].max())
     energy.set(title="Kinetic energy", xlabel="$t/T$", ylabel=r"$\langle v\cdot v\rangle/2$", ylim=(0, 1.15 * highest))
-    drawn = (truth["wavenumber"] >= 1) & (truth["wavenumber"] <= 2 * cutoff)
-    spectrum.axvline(cutoff, color=GUIDE, linestyle=":")
+    drawn = truth["energy_flow"][(truth["wavenumber"] >= 1) & (truth["wavenumber"] <= 2 * cutoff)]
+    mark_cutoff(spectrum, cutoff)
     spectrum.set(title="Mean spectrum", xlabel="$k$", ylabel="$E(k)$", xlim=(0.9, 2 * cutoff),
-                 ylim=(truth["flow"][drawn].min() / 3, 3 * truth["flow"][drawn].max()))
+                 ylim=(drawn.min() / 3, 3 * drawn.max()))
     number_wavenumbers(spectrum)
     density.set(title="Acceleration PDF", xlabel="$a$ / its standard deviation", ylim=(1e-6, 1))
-    legend_at_foot(figure, energy, _legend_columns(variants, 2))
+    legend_at_foot(figure, energy)
     letter((energy, spectrum, density))
     return figure

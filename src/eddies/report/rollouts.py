@@ -1,17 +1,16 @@
 """The report sections on rollouts: figures of several variants side by side, and their numbers at the last common time
 of model and true tracers."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from eddies.analysis import disorder
-from eddies.measures import MEASURES
 from eddies.report import rollout_figures as draw
-from eddies.report.page import Metric, Section, side_by_side
-from eddies.report.rollout_figures import Variants
+from eddies.report.figures import Variant
+from eddies.report.page import Section
 
 # Description of each [simulation] method. The attributes of the rollout replace the names in braces.
 METHODS = {
@@ -20,65 +19,45 @@ METHODS = {
     "eulerian": "Eulerian large-eddy simulation on {cells}³ cells, |kᵢ| ≤ {largest_wavenumber}, {fluid}, {equations} "
                 "velocity, closure: {closure}, started from the {start}",
 }
-WITHOUT_KERNEL = "it needs velocity gradients from the smoothing kernel, and there is no kernel.h5"
-SAMPLES = "between two samples of the truth of equal size"
 LABELS = {
-    "method": "what moved the particles", "integrator": "integrator", "status": "status",
-    "stable": "stable to the end", "turnovers": "eddy turnovers of the rollout",
+    "method": "what moved the particles", "turnovers": "eddy turnovers of the rollout",
     "two_flows": "model and truth are forced differently", "broken": "model is not finite from (T)",
     "outside_training": "pairs outside the training range, largest share over time",
     "closure_iterations": "iterations of a solve for the resolved velocity, mean",
     "closure_most_iterations": "iterations of a solve, maximum",
     "closure_residual": "largest residual of a solve / rms velocity",
     "closure_not_converged": "solves that did not converge", "last_common_time": "last common time / T",
-    "energy_ratio": "kinetic energy of the particles at the end, model / truth",
-    "energy_ratio_no_force": "the same ratio for particles without any force",
+    "energy_ratio_no_force": "energy, model / truth, for particles without any force",
     "velocity_error": "velocity error by particle at the end (normalised L2)",
     "early_time": "early time / T (half a turnover, or the end if it is earlier)",
     "early_velocity_error": "velocity error by particle at the early time",
     "early_velocity_error_no_force": "the same error for particles without any force",
-    "velocity_kl": "KL divergence of the velocity PDF at the end",
-    "acceleration_kl": "KL divergence of the acceleration PDF at the end",
-    "velocity_kl_floor": f"KL divergence of the velocity PDF {SAMPLES}",
-    "acceleration_kl_floor": f"KL divergence of the acceleration PDF {SAMPLES}",
     "acceleration_rms_ratio": "rms of the acceleration, model / truth",
     "plane_difference": "relative difference of u_x in the last plane",
-    "qr_kl": "KL divergence of the Q–R joint PDF", "qr_kl_floor": f"KL divergence of the Q–R joint PDF {SAMPLES}",
     "filter_wavenumber": "filter wavenumber k_d = π/d",
-    "spectrum_error": "spectrum error, rms of ln(E/E_filtered) over 1 ≤ k ≤ k_d",
-    "spectrum_error_floor": "spectrum error of the true tracers",
     "band_energy_ratios": "energy of bands of wavenumbers, model / filtered flow",
     "band_energy_ratios_floor": "the same ratios for the true tracers",
     "nearest_distance_kl": "KL divergence of the nearest-neighbour distance PDF",
-    **{key: words for key, words in MEASURES.items() if key.endswith(("_drift", "count_variance")) or "structure" in key
-       or "flatness" in key or key.startswith(("acceleration_c", "acceleration_v", "pair", "tetrad"))},
-    "seconds_per_step": "seconds of a step (median, without storing)", "particles": "particles", "ranks": "ranks",
+    "seconds_per_step": "seconds of a step (median, without storing)",
     "storing_share": "share of the wall time that storing took",
-    "evaluations_per_turnover": "evaluations of the forces per turnover",
-    "stage_seconds": "wall seconds by stage",
-}
-FORCED = {
+    "evaluations_per_turnover": "evaluations of the forces per turnover"}
+OF_FORCED = {
     "energy": "kinetic energy", "acceleration_rms": "rms of an acceleration component",
-    "spectrum_error": "error of the mean spectrum, rms of ln(E/E_filtered) over 1 ≤ k ≤ k_d",
-    "velocity_kl": "KL divergence of the velocity PDF, standardised",
-    "acceleration_kl": "KL divergence of the acceleration PDF, standardised",
-    "qr_kl": "KL divergence of the Q–R joint PDF, standardised",
-    "true_energy": "kinetic energy, true tracers over the same time",
+    "spectrum_error": "error of the mean spectrum", "true_energy": "kinetic energy, true tracers over the same time",
     "true_acceleration_rms": "rms of an acceleration component, true tracers over the same time",
     "average_from": "averages from (T)"}
 REASONS = {
-    "qr_kl": WITHOUT_KERNEL, "qr_kl_floor": WITHOUT_KERNEL, "closure_iterations": "no step was taken",
-    "seconds_per_step": "too few steps to time: the first two, and the first two after a restart, are left out",
-    **{key: "it needs several frames" for key in MEASURES if key.startswith(("structure", "flatness", "acceleration_c",
-                                                                            "pair", "tetrad"))}}
+    **dict.fromkeys(("qr_kl", "qr_kl_floor"),
+                    "it needs velocity gradients from the smoothing kernel, and there is no kernel.h5"),
+    "seconds_per_step": "too few steps to time: the first two, and the first two after a restart, are left out"}
 # Figures: name of the file, table that a variant needs for it, function, title, caption.
-FIGURES: tuple[tuple[str, str, Callable[[Variants], Figure], str, str], ...] = (
+FIGURES: tuple[tuple[str, str, Callable[[Sequence[Variant]], Figure], str, str], ...] = (
     ("figure-4-velocity", "planes", draw.velocity_planes, "Velocity over time (the paper's Fig. 4)",
      "u_x in the plane z = π, of true tracers and models from {words}."),
     ("figure-5-vorticity-energy", "planes", draw.vorticity_and_energy,
      "Vorticity and kinetic energy (the paper's Fig. 5)",
      "Plane z = π at the last common time, of true tracers and models from {words}."),
-    ("figure-6-pdfs", "pdfs", draw.particle_pdfs, "PDFs of velocity and acceleration (the paper's Fig. 6)",
+    ("figure-6-pdfs", "errors", draw.particle_pdfs, "PDFs of velocity and acceleration (the paper's Fig. 6)",
      "All components, centred and divided by the truth's standard deviation at that time. Values beyond the axis count "
      "in the last bins."),
     ("figure-7-invariants", "invariants", draw.invariant_planes,
@@ -123,44 +102,34 @@ def rollout_numbers(found: Mapping[str, Any], seconds: Mapping[str, float]) -> d
     return numbers | {"stage_seconds": dict(seconds) or None}
 
 
-def section(variants: Variants, numbers: Mapping[str, Mapping[str, Any]], others: int) -> Section:
+def section(variants: Sequence[Variant], numbers: Sequence[Mapping[str, Any]], others: int) -> Section:
     """Return the section with the paper's Figs. 4 to 9, Lagrangian statistics, and the disorder of the particles.
 
-    numbers: `rollout_numbers` of each variant. others: the number of further variants, which are not shown.
+    variants: with the numbers and tables of measures.h5. numbers: `rollout_numbers` of each variant. others: the number
+    of further variants, which are not shown.
     """
-    first = next(iter(variants.values()))
-    text = (f"T = {first.turnover:.3g} is the eddy turnover time. Numbers are those of the last time that a model and "
-            "the true tracers have in common.")
+    text = (f"T = {draw.turnover_of(variants):.3g} is the eddy turnover time. Numbers are those of the last time that "
+            "a model and the true tracers have in common.")
     if others:
         text += f" {others} more variants are in metrics.json; `--variant` chooses those that are shown."
-    found = Section("rollouts", "Rollouts against the truth", text, folded=True)
     notices: dict[str, list[str]] = {}
-    for each in variants.values():
+    for each in variants:
         for notice in _notices(each.numbers):
             notices.setdefault(notice, []).append(each.label)
-    found.notices = [f"{', '.join(labels)}: {notice}" for notice, labels in notices.items()]
-    found.metrics = side_by_side({each.label: metrics_of(numbers[name], LABELS, each.numbers["not_compared"])
-                                  for name, each in variants.items()})
-    words = next((each.numbers["reconstructed_by"] for each in variants.values()), "")
+    found = Section("rollouts", "Rollouts against the truth", text, labels=LABELS, reasons=REASONS,
+                    columns={each.label: own for each, own in zip(variants, numbers)},
+                    notices=[f"{', '.join(labels)}: {notice}" for notice, labels in notices.items()])
     for name, table, function, title, caption in FIGURES:
-        if chosen := with_same_truth({key: each for key, each in variants.items() if table in each.tables}):
+        if chosen := with_same_truth([each for each in variants if table in each.tables]):
             found.add_figure(name, title, lambda function=function, chosen=chosen: function(chosen),
-                             caption.format(words=words))
+                             caption.format(words=variants[0].numbers["reconstructed_by"]))
     return found
 
 
-def with_same_truth(variants: Variants) -> Variants:
+def with_same_truth(variants: Sequence[Variant]) -> list[Variant]:
     """Return the variants whose truth is that of the first one, at the same first time."""
-    truths = {name: (each.numbers["truth"], each.numbers["attributes"]["start_time"])
-              for name, each in variants.items()}
-    return {name: each for name, each in variants.items() if truths[name] == next(iter(truths.values()))}
-
-
-def metrics_of(numbers: Mapping[str, Any], labels: Mapping[str, str], reason: str) -> list[Metric]:
-    """Return the metrics of numbers in the order of `labels`. `reason` says why a number is missing; "" if REASONS
-    do."""
-    return [Metric(key, label, numbers[key], reason if reason and key != "seconds_per_step" else REASONS.get(key, ""))
-            for key, label in labels.items() if key in numbers]
+    truths = [(each.numbers["truth"], each.numbers["attributes"]["start_time"]) for each in variants]
+    return [each for each, truth in zip(variants, truths) if truth == truths[0]]
 
 
 def _notices(found: Mapping[str, Any]) -> Iterator[str]:
@@ -186,20 +155,18 @@ def _notices(found: Mapping[str, Any]) -> Iterator[str]:
                f"residual is {numbers['closure_residual']:.1e} of the rms velocity.")
 
 
-def forced_section(variants: Variants) -> Section:
+def forced_section(variants: Sequence[Variant]) -> Section:
     """Return the section on forced rollouts: averages over the second half of their time, and those of the stationary
     state of the ground truth."""
+    compared = [each for each in variants if each.numbers["forced"]]
     found = Section(
         "forced", "Forced rollouts beside the stationary state",
         "Averages over the second half of a rollout are compared with those of the filtered flow over its stationary "
         "state. Standard errors are those of blocks of a turnover or more, because closer frames are not independent "
         "samples. PDFs are compared with those of the true tracers at the start, each in units of its own standard "
-        "deviation.", folded=True)
-    found.notices = [f"{each.label}: the rollout is not compared: the model has no finite frame."
-                     for each in variants.values() if not each.numbers["forced"]]
-    compared = {name: each for name, each in variants.items() if each.numbers["forced"]}
-    found.metrics = side_by_side({each.label: metrics_of(each.numbers["forced"], FORCED, "")
-                                  for each in compared.values()})
+        "deviation.", labels=OF_FORCED, columns={each.label: each.numbers["forced"] for each in compared},
+        notices=[f"{each.label}: the rollout is not compared: the model has no finite frame." for each in variants
+                 if not each.numbers["forced"]])
     if chosen := with_same_truth(compared):
         found.add_figure("forced", "Forced rollouts", lambda: draw.forced_rollouts(chosen),
                          "Band: standard deviation of the energy of the stationary flow in time. Dotted: k_d.")

@@ -11,8 +11,8 @@ from matplotlib.lines import Line2D
 
 from eddies.analysis.pareto import COST, cheapest_grid, pareto_front, verdict
 from eddies.measures import DRAWN, MEASURES
-from eddies.report.figures import DNS, GUIDE, Look, letter, panels, plain_log_ticks, styled
-from eddies.report.page import Metric, Section
+from eddies.report.figures import DNS, GUIDE, Look, legend_at_foot, letter, panels, plain_log_ticks, styled
+from eddies.report.page import Section
 
 Row = Mapping[str, Any]
 
@@ -87,10 +87,10 @@ def is_stable(row: Row) -> bool:
 
 
 def section(table: ErrorAgainstTime, notes: Sequence[str] = ()) -> Section:
-    """Return the section with a summary, `notes` on the numbers, the figure, and the table of errors and costs."""
-    metrics = [Metric(row["name"], row["label"], {title: _with_spread(row, key) for key, title in COLUMNS.items()})
-               for row in table.rows]
-    part = Section("summary", "Summary", " ".join([*table.summary, *notes, TEXT]), metrics=metrics,
+    """Return the section with a summary, `notes` on the numbers, the table of errors and costs, and the figure."""
+    part = Section("summary", "Summary", " ".join([*table.summary, *notes, TEXT]),
+                   columns={title: {row["label"]: _with_spread(row, key) for row in table.rows}
+                            for key, title in COLUMNS.items()},
                    notices=[_notice(row) for row in table.rows if not is_stable(row) or row[COST] is None])
     if len(table.rows) > 1 and table.drawn:
         part.add_figure("error-against-run-time", "Error against run time", lambda: scatter(table, table.drawn),
@@ -127,15 +127,13 @@ def scatter(table: ErrorAgainstTime, measures: Sequence[str]) -> Figure:
     if table.stopped():
         styles.append(Line2D([], [], color=DNS, marker="x", linestyle="", label="unstable"))
     styles.append(Line2D([], [], color=GUIDE, linestyle="--", label="Pareto front"))
-    across = 5  # entries in a line of the legend
-    figure, axes = panels(-(-len(measures) // columns), columns, (5.4, 4.2) if columns == 2 else (9.3, 6.0),
-                          foot=0.15 + 0.2 * -(-len(styles) // across))
+    figure, axes = panels(-(-len(measures) // columns), columns, (5.4, 4.2) if columns == 2 else (9.3, 6.0))
     for axis in axes.flat[len(measures):]:
         axis.remove()
     for axis, measure in zip(axes.flat, measures):
         _draw_panel(axis, table, measure)
     letter(axes.flat[:len(measures)])
-    figure.legend(handles=styles, loc="lower center", ncols=across, columnspacing=1.2, handletextpad=0.4)
+    legend_at_foot(figure, styles)
     return figure
 
 

@@ -10,9 +10,17 @@ from eddies.analysis.isotropic_turbulence import acceleration_constant
 from eddies.analysis.pdfs import bin_centres, gaussian
 from eddies.analysis.tracer_statistics import EDGES, TracerStatistics
 from eddies.report.figures import BLUE, DNS, FOURTH, GUIDE, MODEL, SECOND, letter, number_wavenumbers, panels, styled
-from eddies.report.page import Metric, Section
+from eddies.report.page import Section
 
 COLOURS = (BLUE, MODEL, SECOND, FOURTH)
+LABELS = {
+    "tracer_energy_ratio_first": "⟨v·v⟩ of tracers / filtered field, at the release",
+    "tracer_energy_ratio_last": "the same ratio at the last stored field",
+    "tracer_energy_sampling_error": "sampling error of the ratio at the release (standard deviation)",
+    "acceleration_kurtosis": "kurtosis of the acceleration (Gaussian: 3)",
+    "structure_function_exponent": "exponent of the Lagrangian structure function at short lags (smooth: 2)",
+    "ballistic_exponent": "exponent of the pair dispersion at short times (ballistic: 2)",
+    "ballistic_prefactor": "⟨|r − r₀|²⟩ / (S₂(r₀) t²) at the first frame after the release (ballistic: 1)"}
 TOO_FEW = "there are too few frames, or too few pairs of tracers"
 
 
@@ -25,33 +33,23 @@ def section(found: TracerStatistics, scales: Mapping[str, float], power: float |
     otherwise they follow the whole flow.
     """
     kurtosis, (first, last) = found.kurtosis, found.energy_ratio[[0, -1]]
-    metrics = [
-        Metric("tracer_energy_ratio_first", "⟨v·v⟩ of tracers / filtered field, at the release", float(first)),
-        Metric("tracer_energy_ratio_last", "the same ratio at the last stored field", float(last)),
-        Metric("tracer_energy_sampling_error", "sampling error of the ratio at the release (standard deviation)",
-               float(found.energy_error[0])),
-        Metric("acceleration_kurtosis", "kurtosis of the acceleration (Gaussian: 3)", kurtosis),
-    ]
+    numbers = {"tracer_energy_ratio_first": float(first), "tracer_energy_ratio_last": float(last),
+               "tracer_energy_sampling_error": float(found.energy_error[0]), "acceleration_kurtosis": kurtosis}
+    labels = LABELS
     if scales["viscosity"] > 0:
-        constant = found.acceleration_rms**2 * scales["viscosity"] ** 0.5 / scales["dissipation_rate"] ** 1.5
-        whole = acceleration_constant(scales["reynolds_lambda"])
-        metrics.append(Metric("acceleration_constant", "a_0 = a_rms² ν^½ ε^(−3/2) at the release (unfiltered flow: "
-                              f"{whole:.3g}, Sawford et al. 2003)", float(constant)))
-    metrics += [
-        Metric("structure_function_exponent", "exponent of the Lagrangian structure function at short lags (smooth: 2)",
-               found.structure_exponent, TOO_FEW),
-        Metric("ballistic_exponent", "exponent of the pair dispersion at short times (ballistic: 2)",
-               found.ballistic_exponent, TOO_FEW),
-        Metric("ballistic_prefactor", "⟨|r − r₀|²⟩ / (S₂(r₀) t²) at the first frame after the release (ballistic: 1)",
-               found.ballistic_prefactor, TOO_FEW),
-    ]
+        numbers["acceleration_constant"] = float(
+            found.acceleration_rms**2 * scales["viscosity"] ** 0.5 / scales["dissipation_rate"] ** 1.5)
+        labels = {**LABELS, "acceleration_constant": "a_0 = a_rms² ν^½ ε^(−3/2) at the release (unfiltered flow: "
+                  f"{acceleration_constant(scales['reynolds_lambda']):.3g}, Sawford et al. 2003)"}
+    numbers |= {"structure_function_exponent": found.structure_exponent,
+                "ballistic_exponent": found.ballistic_exponent, "ballistic_prefactor": found.ballistic_prefactor}
     text = f"Tracers follow the {'filtered' if filtered else 'whole'} flow."
     if power is not None:
         text += f" It stays forced with a power of {power:.3g} per mass." if power > 0 else " It is not forced."
     if filtered:
         text += (" Their accelerations are those of the eddies that pass the filter. They are smaller than the "
                  "literature's for the whole flow.")
-    shown = Section("tracers", "Tracers", text, metrics=metrics)
+    shown = Section("tracers", "Tracers", text, numbers, labels, dict.fromkeys(numbers, TOO_FEW))
     shown.add_figure(
         "tracers", "Statistics of the tracers", lambda: tracers(found, scales),
         "A: energy; grey: two standard deviations for the same number of random points. B: accelerations from "

@@ -30,11 +30,11 @@ from eddies.io.trajectories import Trajectory
 from eddies.measures import finite
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
-from eddies.pipeline import MAKER_OF
-from eddies.report import figures, ground_truth, kernel, models, reconstruction, rollouts, stationary, steps, tracers
-from eddies.report import summary as summary_of_variants
-from eddies.report.page import Metric, RunRecord, Section, shown, strict, write_page
-from eddies.report.rollout_figures import Drawn
+from eddies.pipeline import FILE_OF, MAKER_OF
+from eddies.report import (figures, ground_truth, kernel, models, reconstruction, rollouts, stationary, steps, summary,
+                           tracers)
+from eddies.report.figures import Variant
+from eddies.report.page import Section, shown, strict, write_page
 from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.scene.terms import PRESETS
 from eddies.workflows.ground_truth.stationary import read_stationary_span
@@ -49,19 +49,30 @@ log = logging.getLogger("eddies")
 
 MOST_SHOWN = 6  # largest number of variants in the figures
 SIMULATION = "dns_seconds_per_turnover"
+COSTS = {"dns_seconds_per_step": "DNS: seconds of a step (median, without storing)",
+         SIMULATION: "DNS: wall seconds per turnover (median step, mean number of steps)",
+         "stage_seconds": "wall seconds by stage"}
+REASONS = {SIMULATION: "the simulation took no step",
+           "stage_seconds": "no stage_seconds.json: the stages were not run by `eddies`"}
 SOURCE_OF_TRACKS = ("{in_file} measured tracks from {file}, on average {mean_count:.0f} in a frame; {complete} are in "
                     "all frames. Fields are reconstructed from them by least squares. The dissipation rate is the "
                     "value of the literature for this velocity and integral scale.")
-SHARED = "ground_truth", "kernel", "reconstruction"  # kinds of products that have a section for the whole run
 
 
-@dataclass(frozen=True)
-class Run:
-    """A run directory, and the variants in it.
+@dataclass
+class Report:
+    """A run directory, and the report that is made of it.
 
-    scene: None if it cannot be read. variants: directories of the rollouts of each variant, by name. A run without
-    variants counts as one variant. chosen: names of the variants to show. old: products that were made with other
-    settings than those of the last job, as `old_products`.
+    Parameters
+    ----------
+    scene : None if it cannot be read.
+    variants : directories of the rollouts of each variant, by name. A run without variants counts as one variant.
+    chosen : names of the variants to show.
+    old : products that were made with other settings than those of the last job, as `old_products`.
+    sections : the content of the page.
+    provenance : that of the products in the directory `base`, by kind.
+    numbers : the content of metrics.json without warnings.
+    scanned : a sentence on each product with numbers that are not finite, else "", by file.
     """
 
     directory: Path
@@ -69,10 +80,14 @@ class Run:
     variants: Mapping[str, Sequence[Path]]
     chosen: Sequence[str] = ()
     old: Mapping[Path, Sequence[str]] = field(default_factory=dict)
+    sections: list[Section] = field(default_factory=list)
+    provenance: dict[str, dict[str, Any]] = field(default_factory=dict)
+    numbers: dict[str, Any] = field(default_factory=dict)
+    scanned: dict[Path, str] = field(default_factory=dict)
 
     @classmethod
-    def read(cls, directory: Path, chosen: Sequence[str] = ()) -> Run:
-        """Read a run directory. Raises SceneError if `chosen` names an unknown variant."""
+    def of(cls, directory: Path, chosen: Sequence[str] = ()) -> Report:
+        """Return a report without content. Raises SceneError if `chosen` names an unknown variant."""
         scene, runs, old = None, {}, {}
         with contextlib.suppress(SceneError):
             scene = load_scene(directory / "scene.toml")
@@ -85,7 +100,7 @@ class Run:
         return cls(directory, scene, runs or {name: [directory]}, chosen, old)
 
     @property
-    def measured(self) -> list[Path]:
+    def rollouts(self) -> list[Path]:
         """The directories of all rollouts that exist."""
         return [where for runs in self.variants.values() for where in runs if (where / ROLLOUT).exists()]
 
@@ -106,12 +121,37 @@ class Run:
         """The directory whose products the page describes: that of the first variant shown."""
         return self.variants[self.shown[0]][0] if self.shown else self.directory
 
+    def scene_of(self, name: str) -> Scene | None:
+        """Return the scene of a variant."""
+        return self.scene and self.scene.variant.get(name, self.scene)
+
+    @cached_property
     def looks(self) -> dict[str, figures.Look]:
-        """Return the colour and the marker of each variant."""
-        known = {name: (self.scene.variant.get(name, self.scene) if self.scene else None) for name in self.variants}
-        cells = {name: each.eulerian.cells for name, each in known.items()
-                 if each is not None and each.simulation is not None and each.simulation.on_grid}
+        """The colour and the marker of each variant."""
+        known = {name: self.scene_of(name) for name in self.variants}
+        cells = {name: each.coarse_cells for name, each in known.items() if each is not None and each.coarse_cells}
         return figures.looks({name: [name, *_presets(each)] for name, each in known.items()}, cells)
+
+    def variant(self, name: str, numbers: Mapping[str, Any], tables: Mapping[str, figures.Table]) -> Variant:
+        """Return a variant for figures."""
+        scene = self.scene_of(name)
+        return Variant(scene and scene.label or name, self.looks[name], numbers, tables)
+
+    def first(self, found: Mapping[str, Any]) -> list[Any]:
+        """Return the values of the variants that are shown or, if there are none, the first values."""
+        return [found[name] for name in self.shown if name in found] or [*found.values()][:MOST_SHOWN]
+
+    @contextlib.contextmanager
+    def opened(self, directory: Path, kind: str, alone: Comm) -> Iterator[File | None]:
+        """Open a product and scan it; None if there is none."""
+        path = directory / FILE_OF[kind]
+        if not path.exists():
+            yield None
+            return
+        with open_product(alone, path, kind) as file:
+            if path.resolve() not in self.scanned:
+                self.scanned[path.resolve()] = not_finite(file, kind)
+            yield file
 
 
 def _presets(scene: Scene | None) -> Iterator[str]:
@@ -120,26 +160,6 @@ def _presets(scene: Scene | None) -> Iterator[str]:
         yield scene.simulation.method
     elif scene is not None and scene.model is not None:
         yield from (name for name, terms in PRESETS.items() if set(terms) == set(scene.model.terms))
-
-
-@dataclass
-class Report:
-    """The content of a report.
-
-    provenance: of the products in the base directory, by kind. numbers: what metrics.json holds besides the rows.
-    """
-
-    sections: list[Section] = field(default_factory=list)
-    provenance: dict[str, dict[str, Any]] = field(default_factory=dict)
-    numbers: dict[str, Any] = field(default_factory=dict)
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-
-    def add(self, section: Section) -> None:
-        """Append a section on a product of the whole run, folded, with its numbers."""
-        section.folded = True
-        self.sections.append(section)
-        self.numbers[section.key] = section.numbers
 
 
 def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: StopRequest | None = None,
@@ -155,24 +175,25 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: S
     directory, stop = Path(directory), stop or StopRequest(comm)
     for problem in directory_problems(("report",), comm, directory) if output is None else ():
         raise SceneError(problem)
-    found = in_files(comm, directory, lambda: Run.read(directory, variants))
-    for where in found.measured:
+    report = in_files(comm, directory, lambda: Report.of(directory, variants))
+    for where in report.rollouts:
         _measure().update(where, comm)
         stop.check()
     stop.check()
     alone, output = comm.Split(comm.rank), output or directory / "report"
     try:
-        in_files(comm, output, lambda: _write(found, make(found, comm.size, alone), output))
+        in_files(comm, output, lambda: [_make(report, comm.size, alone), _write(report, output)])
     finally:
         alone.Free()
 
 
 def sections_of(directory: Path, alone: Comm) -> list[Section]:
     """Return the sections of the report of a run directory on one rank, with figures that are not yet made."""
-    found = Run.read(directory)
-    for where in found.measured:
+    report = Report.of(directory)
+    for where in report.rollouts:
         _measure().update(where, alone)
-    return make(found, 1, alone).sections
+    _make(report, 1, alone)
+    return report.sections
 
 
 def _measure() -> Any:
@@ -180,44 +201,40 @@ def _measure() -> Any:
     return measure
 
 
-def make(run: Run, ranks: int, alone: Comm) -> Report:
-    """Read the products and the measures of a run, and return the content of its report. `ranks` is the number of ranks
-    of the job."""
-    report, scanned, looks = Report(), {}, run.looks()
-    labels = {name: (run.scene.variant.get(name, run.scene).label if run.scene else None) or name
-              for name in run.variants}
-    measures = {where: _measure().read(where, alone) for where in run.measured}
-    found = {name: (runs[0], *measures[runs[0]]) for name, runs in run.variants.items() if runs[0] in measures}
-    drawn = {name: Drawn(labels[name], looks[name], *found[name][1:]) for name in run.shown}
-    shared: list[Section] = []
-    cost = _read_shared(run, alone, report, shared, scanned)
-    if run.scene is not None and found:
-        report.sections.append(_compare(run, report, measures, looks, cost, ranks, alone))
-    if drawn:
-        costs = {name: rollouts.rollout_numbers(numbers, read_stage_seconds(where))
-                 for name, (where, numbers, _) in found.items()}
-        report.sections.append(rollouts.section(drawn, costs, len(found) - len(drawn)))
-        report.numbers["rollouts"] = costs
-        if forced := {name: each for name, each in drawn.items() if "forced" in each.numbers}:
-            report.sections.append(rollouts.forced_section(forced))
-        report.numbers["forced"] = {name: numbers["forced"] for name, (_, numbers, _) in found.items()
-                                    if "forced" in numbers}
-    _add_learned(run, alone, report, labels, looks, scanned)
-    for section in shared:
-        report.add(section)
+def _make(report: Report, ranks: int, alone: Comm) -> None:
+    """Read the products and the measures of a run, and add the content of its report. `ranks` is the number of ranks of
+    the job."""
+    measures = {where: _measure().read(where, alone) for where in report.rollouts}
+    found = {name: report.variant(name, *measures[runs[0]]) for name, runs in report.variants.items()
+             if runs[0] in measures}
+    shared = _shared(report, alone)
     if not report.provenance:
-        raise ProductError(f"{run.directory}: holds none of {', '.join(f'{kind}.h5' for kind in MAKER_OF)}; "
+        raise ProductError(f"{report.directory}: holds none of {', '.join(stage.file for stage in MAKER_OF.values())}; "
                            "run `eddies dns SCENE` first")
-    report.warnings = [*doubts(run.base, report.provenance, run.old), *_other_doubts(run),
-                       *(words for words in scanned.values() if words)]
-    return report
+    if report.scene is not None and found:
+        report.sections.append(_compare(report, measures, shared[0].numbers.get(SIMULATION), ranks, alone))
+    if found:
+        drawn = report.first(found)
+        numbers = {name: rollouts.rollout_numbers(each.numbers, read_stage_seconds(report.variants[name][0]))
+                   for name, each in found.items()}
+        report.numbers["rollouts"] = numbers
+        report.numbers["forced"] = {name: each.numbers["forced"] for name, each in found.items()
+                                    if "forced" in each.numbers}
+        report.sections.append(rollouts.section(drawn, report.first(numbers), len(found) - len(drawn)))
+        if forced := [each for each in drawn if "forced" in each.numbers]:
+            report.sections.append(rollouts.forced_section(forced))
+    _add_learned(report, alone)
+    report.sections += shared
+    report.numbers |= {section.key: section.numbers for section in shared}
+    report.numbers["warnings"] = [*doubts(report.base, report.provenance, report.old), *_other_doubts(report),
+                                  *(words for words in report.scanned.values() if words)]
 
 
-def _read_shared(run: Run, alone: Comm, report: Report, sections: list[Section], scanned: dict[Path, str]
-                 ) -> list[Metric]:
-    """Read the products in the base directory: their provenance and, of those in SHARED, sections. Return the metrics
-    of the cost of the direct simulation. Results of `not_finite` are added to `scanned`, by file."""
-    cost: list[Metric] = []
+def _shared(report: Report, alone: Comm) -> list[Section]:
+    """Read the products in the base directory and add their provenance. Return the sections on costs and on products of
+    the whole run."""
+    cost: dict[str, Any] = {}
+    sections: list[Section] = []
     readers = {
         "ground_truth": _ground_truth_sections,
         "kernel": lambda file: [kernel.section(read_json(file, "description")["support"], **{
@@ -226,69 +243,48 @@ def _read_shared(run: Run, alone: Comm, report: Report, sections: list[Section],
             read_attributes(file, "about"), read_table(file, "errors_over_time"),
             read_table(file, "errors_of_fields") if "errors_of_fields" in file else {}, _middle_plane(file))]}
     for kind in MAKER_OF:
-        path = run.base / f"{kind}.h5"
-        if not path.exists():
-            continue
-        with open_product(alone, path, kind) as file:
-            report.provenance[kind] = read_provenance(file)
-            scanned[path.resolve()] = not_finite(file, kind)
-            if kind == "ground_truth" and "tracks" not in file:
-                cost = _simulation_cost(file)
-            if kind in SHARED:
-                sections[:0] = readers[kind](file)
-    seconds = {**read_stage_seconds(run.directory), **read_stage_seconds(run.base)}
-    sections.insert(0, Section("cost", "Cost", "Wall seconds of stages and of steps.", metrics=[*cost, Metric(
-        "stage_seconds", "wall seconds by stage", seconds or None,
-        "no stage_seconds.json: the stages were not run by `eddies`")]))
-    return cost
+        with report.opened(report.base, kind, alone) as file:
+            if file is not None:
+                report.provenance[kind] = read_provenance(file)
+                if kind == "ground_truth" and "tracks" not in file:
+                    cost = _simulation_cost(file)
+                if kind in readers:
+                    sections[:0] = readers[kind](file)
+    seconds = {**read_stage_seconds(report.directory), **read_stage_seconds(report.base)}
+    return [Section("cost", "Cost", "Wall seconds of stages and of steps.", {**cost, "stage_seconds": seconds or None},
+                    COSTS, REASONS), *sections]
 
 
-def _add_learned(run: Run, alone: Comm, report: Report, labels: Mapping[str, str], looks: Mapping[str, figures.Look],
-                 scanned: dict[Path, str]) -> None:
+def _add_learned(report: Report, alone: Comm) -> None:
     """Add sections on the models and the steps of the variants."""
-    trained: dict[str, models.TrainedModel] = {}
-    searches: dict[str, steps.Search] = {}
-    for name, (where, *_) in run.variants.items():
-        for kind in ("model", "step", "rollout"):
-            path = where / f"{kind}.h5"
-            if not path.exists():
-                continue
-            with open_product(alone, path, kind) as file:
-                if path.resolve() not in scanned:
-                    scanned[path.resolve()] = not_finite(file, kind)
-                if kind == "model":
-                    trained[name] = _model(file, labels[name], looks[name])
-                elif kind == "step":
-                    searches[name] = steps.Search(labels[name], looks[name], read_attributes(file, "found"), {
-                        method: read_table(file, f"trials/{method}") for method in file["trials"]})
-    if trained:
-        report.numbers["models"] = {name: _values(each.metrics) for name, each in trained.items()}
-        report.sections.append(models.section(_first(trained, run)))
-    if searches:
-        report.numbers["steps"] = {name: _values([*each.chosen, *each.tried]) for name, each in searches.items()}
-        report.sections.append(steps.section(_first(searches, run)))
+    trained: dict[str, Variant] = {}
+    searches: dict[str, Variant] = {}
+    for name, (where, *_) in report.variants.items():
+        with report.opened(where, "model", alone) as file:
+            if file is not None:
+                trained[name] = report.variant(name, *_model(file))
+        with report.opened(where, "step", alone) as file:
+            if file is not None:
+                searches[name] = report.variant(name, read_attributes(file, "found"), {
+                    method: read_table(file, f"trials/{method}") for method in file["trials"]})
+        with report.opened(where, "rollout", alone):
+            pass
+    for key, part, all_of_it in (("models", models, trained), ("steps", steps, searches)):
+        if all_of_it:
+            report.numbers[key] = {name: part.numbers_of(each) for name, each in all_of_it.items()}
+            report.sections.append(part.section(report.first(all_of_it)))
 
 
-def _first(found: Mapping[str, Any], run: Run) -> dict[str, Any]:
-    """Return the entries of the variants that are shown or, if there are none, the first entries."""
-    return {name: found[name] for name in ([name for name in run.shown if name in found] or [*found][:MOST_SHOWN])}
-
-
-def _values(metrics: Sequence[Metric]) -> dict[str, Any]:
-    return {metric.key: metric.value for metric in metrics}
-
-
-def _model(file: File, label: str, look: figures.Look) -> models.TrainedModel:
-    """Read model.h5. A model with the weights of another run shares their history."""
+def _model(file: File) -> tuple[dict[str, Any], dict[str, figures.Table]]:
+    """Return what the report shows of model.h5, as `models.section` needs it."""
     provenance = read_provenance(file)
-    tables = {name: read_table(file, name) for name in (
-        "a_priori", "acceleration_sample", "density_rate_sample", "history", "source_a_priori") if name in file}
     source, others = provenance.get("source"), others_trained_on(provenance)
     if source and "truths" in source:
         others = [path if reached is None else f"{path} (M_t = {reached:.3f})"
                   for path, reached in source["truths"].items()]
-    return models.TrainedModel(label, look, read_json(file, "description"), tables, source, others,
-                               provenance.get("mach_turbulent"))
+    return {**read_json(file, "description"), "provenance": provenance, "others": others}, {
+        name: read_table(file, name) for name in (
+            "a_priori", "acceleration_sample", "density_rate_sample", "history", "source_a_priori") if name in file}
 
 
 def _ground_truth_sections(file: File) -> list[Section]:
@@ -328,49 +324,43 @@ def _middle_plane(file: File) -> np.ndarray | None:
     return series.read(-1, "velocity", middle, middle + 1)[0, 0] if "velocity" in series.variables else None
 
 
-def _simulation_cost(file: File) -> list[Metric]:
-    """Return metrics of the cost of the steps of the direct simulation in an open ground_truth.h5."""
+def _simulation_cost(file: File) -> dict[str, Any]:
+    """Return the cost of the steps of the direct simulation in an open ground_truth.h5."""
     statistics, turnover = read_table(file, "statistics"), file["reference"].attrs["eddy_turnover_time"]
     seconds = float(np.median(statistics["seconds_per_step"]))
     elapsed = np.diff(statistics["time"])
     steps = (elapsed / statistics["time_step"][1:]).sum() / elapsed.sum() * turnover if len(elapsed) else None
-    return [Metric("dns_seconds_per_step", "DNS: seconds of a step (median, without storing)", seconds),
-            Metric(SIMULATION, "DNS: wall seconds per turnover (median step, mean number of steps)",
-                   None if steps is None else float(steps) * seconds, "the simulation took no step")]
+    return {"dns_seconds_per_step": seconds, SIMULATION: None if steps is None else float(steps) * seconds}
 
 
-def _other_doubts(run: Run) -> Iterator[str]:
+def _other_doubts(report: Report) -> Iterator[str]:
     """Yield warnings about the rollouts in other directories than the base directory."""
-    for where in [each for runs in run.variants.values() for each in runs if each != run.base]:
-        beside = {kind: origin for kind in MAKER_OF if (origin := product_provenance(where / f"{kind}.h5"))}
-        yield from (f"{where.relative_to(run.directory)}: {sentence}" for sentence in doubts(where, beside, run.old)
-                    if sentence.startswith(ROLLOUT))
+    for where in [each for runs in report.variants.values() for each in runs if each != report.base]:
+        beside = {kind: origin for kind in MAKER_OF if (origin := product_provenance(where / FILE_OF[kind]))}
+        yield from (f"{where.relative_to(report.directory)}: {sentence}"
+                    for sentence in doubts(where, beside, report.old) if sentence.startswith(ROLLOUT))
 
 
-def _compare(run: Run, report: Report, measures: Mapping[Path, Sequence[Any]], looks: Mapping[str, figures.Look],
-             cost: Sequence[Metric], ranks: int, alone: Comm) -> Section:
+def _compare(report: Report, measures: Mapping[Path, Sequence[Any]], of_truth: float | None, ranks: int,
+             alone: Comm) -> Section:
     """Return the section on all variants, and add rows, summary and what belongs to them to the numbers of the report.
 
-    measures: numbers and tables of each rollout, by its directory. cost: metrics of the direct simulation.
+    measures: numbers and tables of each rollout, by its directory. of_truth: seconds of a turnover of the ground truth.
     """
-    scene = run.scene
+    scene = report.scene
     variants = scene.variant or {scene.name: scene}
-    found = {name: [numbers(measures[where][0]) for where in runs] for name, runs in run.variants.items()
+    found = {name: [numbers(measures[where][0]) for where in runs] for name, runs in report.variants.items()
              if all(where in measures for where in runs)}
-    rows, another = rows_of(scene, run.variants, found, alone, run.old)
+    rows, another = rows_of(scene, report.variants, found, alone, report.old)
     repeating = [name for name, each in variants.items() if each.coarse_cells == each.flow.cells]
-    of_truth = next((metric.value for metric in cost if metric.key == SIMULATION), None)
     simulation = simulation_seconds(rows, repeating, of_truth)
     add_break_even(rows, simulation)
-    table = summary_of_variants.ErrorAgainstTime(rows, run.shown[0], looks)
-    remarks = notes(scene.realisations or (), another, {name: each.tracers for name, each in variants.items()},
-                    {name: each.coarse_cells for name, each in variants.items()})
-    reference = product_attributes(run.base / "ground_truth.h5", "reference")
+    table = summary.ErrorAgainstTime(rows, report.shown[0], report.looks)
+    reference = product_attributes(report.base / FILE_OF["ground_truth"], "reference")
     flow = {key: finite(float(value)) for key, value in reference.items() if isinstance(value, (float, np.number))}
-    report.rows = rows
     report.numbers |= {"name": scene.name, "title": scene.title, "machine": machine(scene.device, ranks), "flow": flow,
                        "simulation_seconds": simulation, "rows": rows, "summary": table.summary}
-    return summary_of_variants.section(table, remarks)
+    return summary.section(table, notes(scene.realisations or (), another, variants))
 
 
 def _draw(sections: Sequence[Section]) -> None:
@@ -383,36 +373,35 @@ def _draw(sections: Sequence[Section]) -> None:
                         type(error).__name__, error)
 
 
-def _write(run: Run, report: Report, output: Path) -> None:
+def _write(report: Report, output: Path) -> None:
     """Draw the figures, write the page and the numbers, and log the main numbers; one rank calls it."""
     _draw(report.sections)
-    rows = [("stage", "ranks", "wall time (s)", "date", "eddies", "commit", "libraries")]
-    seconds = {**read_stage_seconds(run.directory), **read_stage_seconds(run.base)}
+    products = [("stage", "ranks", "wall time (s)", "date", "eddies", "commit", "libraries")]
+    seconds, warnings = report.numbers["cost"]["stage_seconds"] or {}, report.numbers["warnings"]
     for kind, origin in report.provenance.items():
         stage = MAKER_OF[kind].name
-        rows.append((stage, str(origin["ranks"]), shown(seconds[stage]) if stage in seconds else "not stored",
-                     origin["date"], origin["eddies"],
-                     origin["commit"][:12] if origin["commit"] else "not a checkout",
-                     ", ".join(f"{name} {version}" for name, version in origin["libraries"].items())))
-    text = run.scene.to_toml() if run.scene is not None and run.scene.variant else (
+        products.append((stage, str(origin["ranks"]), shown(seconds[stage]) if stage in seconds else "not stored",
+                         origin["date"], origin["eddies"],
+                         origin["commit"][:12] if origin["commit"] else "not a checkout",
+                         ", ".join(f"{name} {version}" for name, version in origin["libraries"].items())))
+    text = report.scene.to_toml() if report.scene is not None and report.scene.variant else (
         list(report.provenance.values())[-1]["scene"])
-    title = tomllib.loads(text).get("title", "untitled scene")
-    record = RunRecord(run.directory.resolve().name, title, text, rows, report.warnings)
-    texts = {"metrics.json": json.dumps(strict({"warnings": report.warnings, **report.numbers}), indent=2,
-                                        allow_nan=False) + "\n"}
-    if report.rows:
+    texts = {"metrics.json": json.dumps(strict(report.numbers), indent=2, allow_nan=False) + "\n"}
+    if "rows" in report.numbers:
         lines = io.StringIO(newline="")
         writer = csv.DictWriter(lines, COLUMNS)
         writer.writeheader()
-        writer.writerows(report.rows)
+        writer.writerows(report.numbers["rows"])
         texts["variants.csv"] = lines.getvalue()
-    write_page(output, record, report.sections, texts)
+    write_page(output, report.sections, texts, name=report.directory.resolve().name, scene=text, products=products,
+               title=tomllib.loads(text).get("title", "untitled scene"), warnings=warnings)
     for section in report.sections:
         count = len(section.illustrations)
         log.info("report: %s%s", section.title, f" ({count} figure{'s' if count > 1 else ''})" if count else "")
         if section.key == "summary":
             log.info("  %s", section.text)
-            for metric in section.metrics:
-                log.info("  %s: %s", metric.label, shown(metric.value))
-    for warning in report.warnings:
+            (_, *titles), *rows = section.table
+            for label, *cells in rows:
+                log.info("  %s: %s", label, ", ".join(map(" ".join, zip(titles, cells))))
+    for warning in warnings:
         log.warning("report: %s", warning)

@@ -14,7 +14,7 @@ from eddies.io.hdf5 import in_files
 from eddies.io.provenance import product_fingerprint, product_provenance
 from eddies.io.run_lock import job_in
 from eddies.parallel.communicator import Comm
-from eddies.pipeline import MEASURED, STAGES, Stage
+from eddies.pipeline import FILE_OF, STAGES, Stage
 from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.workflows.run_directory.fingerprints import DURATION_KEYS, set_files, stage_fingerprint
 from eddies.workflows.resources import in_units
@@ -54,8 +54,8 @@ def _complaint(comm: Comm, path: Path) -> str | None:
 
 def products_in(directory: Path) -> list[Path]:
     """Return the products of all runs in a directory, sorted by path. A link to one of these products is left out."""
-    names = [*(stage.file for stage in STAGES.values() if stage.product), MEASURED]
-    found = sorted((path for name in names for path in directory.rglob(name)), key=Path.is_symlink, reverse=True)
+    found = (path for file in FILE_OF.values() for path in directory.rglob(file))
+    found = sorted(found, key=Path.is_symlink, reverse=True)
     return sorted({path.resolve(): path for path in found}.values())
 
 

@@ -20,7 +20,7 @@ from eddies.io.provenance import environment, read_json
 from eddies.measures import MEASURES, finite
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES
-from eddies.scene.scene import Scene, Tracers
+from eddies.scene.scene import Scene
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import FAILURE, of_other_settings, read_found_step, step_path
 
@@ -167,13 +167,10 @@ def before(model: Path | None, step: Path | None, alone: Comm) -> dict[str, Any]
     return found
 
 
-def notes(seeds: Sequence[int], without_kernel: Sequence[str], tracers: Mapping[str, Tracers],
-          cells: Mapping[str, int]) -> list[str]:
+def notes(seeds: Sequence[int], without_kernel: Sequence[str], variants: Mapping[str, Scene]) -> list[str]:
     """Return the sentences that a reader needs to interpret the numbers.
 
-    seeds: seeds of the realisations. without_kernel: names of the variants without the numbers THROUGH_KERNEL. tracers:
-    the tracers of each variant. cells: the number of cells along each side of each variant's coarse grid, 0 without
-    one.
+    seeds: seeds of the realisations. without_kernel: names of the variants without the numbers THROUGH_KERNEL.
     """
     found = [f"Mean and standard deviation over {len(seeds)} realisations, seeds {', '.join(map(str, seeds))}, that no "
              "training has seen." if len(seeds) > 1 else
@@ -182,14 +179,14 @@ def notes(seeds: Sequence[int], without_kernel: Sequence[str], tracers: Mapping[
         blank = " and ".join(MEASURES[measure] for measure in THROUGH_KERNEL)
         found.append(f"{', '.join(without_kernel)}: no {blank}, because these numbers need the smoothing kernel, and "
                      "its settings differ there.")
-    grids = {name: count for name, count in cells.items() if count}
+    grids = {name: each.coarse_cells for name, each in variants.items() if each.coarse_cells}
     if grids:
         kept = ", ".join(f"{(count - 1) // 3} in {name}" for name, count in grids.items())
-        widths = {tracers[name].filter_width for name in grids}
+        widths = {variants[name].tracers.filter_width for name in grids}
         found.append(f"Largest wavenumber |k_i| that a grid keeps by the 2/3 rule: {kept}; the filter wavenumber "
                      f"k_d = pi/d is "
                      f"{', '.join(f'{np.pi / width:.3g}' for width in sorted(widths, reverse=True))}.")
-    if len({(each.particles, each.filter_width) for each in tracers.values()}) > 1:
+    if len({(each.tracers.particles, each.tracers.filter_width) for each in variants.values()}) > 1:
         found.append("Variants have different particles or filters. Compare only those with the same ones.")
     return found
 

@@ -1,18 +1,18 @@
-"""A rollout in a run directory, the true tracers in its ground truth, and measures of both."""
+"""A rollout in a run directory, the true tracers in its ground truth, and fields and spectra of both."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from eddies.analysis.isotropic_turbulence import StationarySpan
-from eddies.analysis.rollout import Plane, Rollout, same_times
-from eddies.analysis.velocity_gradients import Invariants
+from eddies.analysis.rollout import Rollout, same_times
 from eddies.io.hdf5 import ProductError, open_product, read_attributes, read_table
 from eddies.io.provenance import read_provenance
 from eddies.io.trajectories import IMAGE, Trajectory
@@ -60,46 +60,12 @@ class TrueParticles:
 
 
 @dataclass(frozen=True)
-class ComputedSeries:
-    """A series with one column. Each frame is computed by `make` when it is read."""
-
-    times: np.ndarray
-    column: str
-    make: Callable[[int], np.ndarray]
-
-    @property
-    def columns(self) -> tuple[str]:
-        """The name of the column."""
-        return (self.column,)
-
-    def read(self, frame: int, column: str) -> np.ndarray:
-        """Compute a frame; `column` is the only column."""
-        return self.make(frame)
-
-
-#: A series without frames, in place of the true tracers if there is no ground truth.
-NOTHING = ComputedSeries(np.zeros(0), "velocity", lambda frame: np.zeros((0, 3)))
-
-
-class OnDemand(dict):
-    """A dict from frames to the values of a function. Each value is computed once, when it is first used."""
-
-    def __init__(self, measure: Callable[[int], Any]) -> None:
-        super().__init__()
-        self._measure = measure
-
-    def __missing__(self, frame: int) -> Any:
-        self[frame] = found = self._measure(frame)
-        return found
-
-
-@dataclass(frozen=True)
-class MeasuredRollout:
-    """An open rollout on one rank. Its measures are made when they are first used, and kept.
+class StoredRollout:
+    """An open rollout on one rank.
 
     Parameters
     ----------
-    rollout : the rollout and its truth.
+    rollout : the rollout and its truth, without measures of single frames.
     provenance : provenance of rollout.h5.
     fields : the reconstructed fields of "model" and "truth"; empty if the kernel or the ground truth is missing.
     solver : makes spectra of particles; None without a ground truth.
@@ -114,39 +80,34 @@ class MeasuredRollout:
 
     @property
     def particles(self) -> dict[str, Any]:
-        """The particles of "model" and "truth", by these names; particles without frames are left out."""
-        return {name: run for name, run in (("model", self.rollout.model), ("truth", self.rollout.truth))
-                if len(run.times)}
+        """The particles of "model" and, if they have frames, those of "truth". With a kernel they have velocity
+        gradients."""
+        runs = {"model": self.rollout.model, "truth": self.rollout.truth}
+        return {name: WithGradients(run, self.fields[name]) if self.fields else run for name, run in runs.items()
+                if name == "model" or len(run.times)}
 
-    @property
-    def exported(self) -> dict[str, dict[str, Any]]:
-        """The series to export: a dict with the keys "fields" and "particles". Each value maps "model" and "truth" to a
-        series.
+    def spectrum(self, of: str, frame: int) -> np.ndarray:
+        """Return the energy spectrum (shells,) of the particles of "model" or "truth" in a frame."""
+        return self.solver.of(getattr(self.rollout, of), frame, of)
 
-        Without a kernel, there are no fields, and the particles have no velocity gradients.
-        """
-        if not self.fields:
-            return {"fields": {}, "particles": self.particles}
-        fields = {name: self.fields[name] for name in self.particles}
-        return {"fields": fields,
-                "particles": {name: WithGradients(run, fields[name]) for name, run in self.particles.items()}}
-
-    @property
-    def groups(self) -> dict[str, Any]:
-        """The series that `open_run` adds to the stored ones. They have names like those of groups in a product."""
-        found: dict[str, Any] = {f"particles/{name}": run for name, run in self.particles.items() if name != "model"}
+    def groups(self) -> dict[str, tuple[np.ndarray, dict[str, Callable[[int], np.ndarray]]]]:
+        """Return the groups that `open_run` adds to the stored ones, by name: times, and for each column a function
+        that returns a frame."""
+        found = {}
         for name, run in self.particles.items():
-            if self.solver is not None:
-                found[f"spectra_of_{name}"] = ComputedSeries(run.times, "energy",
-                                                             self.rollout.spectra[name].__getitem__)
+            columns = {column: partial(run.read, column=column) for column in run.columns}
             if self.fields:
-                found[f"fields/{name}"] = self.fields[name]
-                found[f"gradients/{name}"] = ComputedSeries(run.times, GRADIENT, self.fields[name].gradients)
+                found[f"gradients/{name}"] = run.times, {GRADIENT: columns.pop(GRADIENT)}
+                found[f"fields/{name}"] = run.times, {"velocity": partial(self.fields[name].read, variable="velocity")}
+            if self.solver is not None:
+                found[f"spectra_of_{name}"] = run.times, {"energy": partial(self.spectrum, name)}
+            if name == "truth":
+                found["particles/truth"] = run.times, columns
         return found
 
 
 @contextmanager
-def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
+def open_rollout(directory: Path, alone: Comm) -> Iterator[StoredRollout]:
     """Open the rollout of a run directory on one rank, with its ground truth and kernel if they are there.
 
     The ground truth is left out if the rollout was made from another one. Raises ProductError if a file cannot be read.
@@ -167,25 +128,21 @@ def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
             "outside_training": read_table(file, "outside_training")["share"] if "outside_training" in file else None,
             "closure": read_table(file, "closure") if "closure" in file else None}
         if truth_file is None:
-            yield MeasuredRollout(Rollout(attributes, model, NOTHING, {}, {}, {}, None, **tables,
-                                          without_truth=missing), provenance, {})
+            nothing = TrueParticles(model, 0.0, np.zeros(0))
+            yield StoredRollout(Rollout(attributes, model, nothing, {}, {}, {}, None, **tables, without_truth=missing),
+                                provenance, {})
             return
         ground = GroundTruth(truth_file, alone)
-        truth = TrueParticles(ground.trajectory, attributes["start_time"], model.times)
-        both, fields, words = {"model": model, "truth": truth}, {}, ""
+        both = {"model": model, "truth": TrueParticles(ground.trajectory, attributes["start_time"], model.times)}
+        fields, words, span = {}, "", None
         if (directory / "kernel.h5").exists():
             slab = SlabDecomposition(alone, model.length, ground.fields.cells)
             form = load_form(alone, directory / "kernel.h5", ground.scales)
             fields, words = {name: ReconstructedFields(run, form, slab) for name, run in both.items()}, form.words
-        solver = ParticleSpectra(ground.scales, model.length, alone)
-        spectra = {name: OnDemand(lambda frame, name=name: solver.of(both[name], frame, name)) for name in both}
-        invariants = {name: OnDemand(lambda frame, own=own: Invariants.of(own.gradients(frame)))
-                      for name, own in fields.items()}
-        planes = {name: OnDemand(lambda frame, own=own: Plane(*own.plane(frame))) for name, own in fields.items()}
-        rollout = Rollout(attributes, model, truth, read_table(truth_file, "spectra"), ground.reference,
-                          spectra, invariants or None, planes or None, **tables, reconstructed_by=words)
-        span = None
         if "stationary" in truth_file:
             with suppress(ProductError):  # the report says that the span is too short
                 span = read_stationary_span(truth_file)
-        yield MeasuredRollout(rollout, provenance, fields, solver, span)
+        empty = [{"model": {}, "truth": {}} if fields else None for _ in range(2)]
+        rollout = Rollout(attributes, *both.values(), read_table(truth_file, "spectra"), ground.reference,
+                          {"model": {}, "truth": {}}, *empty, **tables, reconstructed_by=words)
+        yield StoredRollout(rollout, provenance, fields, ParticleSpectra(ground.scales, model.length, alone), span)
