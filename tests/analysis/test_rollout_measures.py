@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from eddies.analysis.accuracy import accuracy
 from eddies.analysis.rollout import Rollout
+from eddies.analysis.rollout_measures import measures
 from eddies.analysis.velocity_gradients import Invariants
 from eddies.measures import MEASURES
 
@@ -21,7 +21,7 @@ DRIFTS = {"momentum_drift", "density_drift", "count_variance"}
 class Stored:
     """Particles that move; velocities and accelerations are those of the truth times 1 + growth * time."""
 
-    columns, length = ("position", "velocity", "acceleration"), LENGTH
+    columns, length, total = ("position", "velocity", "acceleration"), LENGTH, 4000
 
     def __init__(self, growth=0.0, times=TIMES, broken=None):
         self.growth, self.times, self.broken = growth, times, broken
@@ -36,15 +36,18 @@ class Stored:
 
 def measured(growth, complete=True, model_times=TIMES, broken=None):
     """The measures of a model whose velocities, with their spectra and gradients, grow too fast."""
-    attributes = {"eddy_turnover_time": TURNOVER, "start_time": 3.0, "status": "complete" if complete else "stopped: x"}
+    attributes = {"eddy_turnover_time": TURNOVER, "start_time": 3.0, "turnovers": 1.0,
+                  "status": "complete" if complete else "stopped: x"}
     runs = {"model": Stored(growth, model_times, broken), "truth": Stored()}
-    flow = {"time": TIMES[::2] + 3.0, "wavenumber": np.arange(9), "filtered": np.tile(SPECTRUM, (4, 1))}
+    spectra = dict.fromkeys(("energy", "filtered"), np.tile(SPECTRUM, (4, 1)))
+    flow = {"time": TIMES[::2] + 3.0, "wavenumber": np.arange(9), **spectra}
     factors = {name: 1 + run.growth * run.times for name, run in runs.items()}
     spectra = {name: dict(enumerate(np.outer(factor**2, SPECTRUM))) for name, factor in factors.items()}
     gradients = {name: {frame: Invariants.of(one * GRADIENT) for frame, one in enumerate(factor)}
                  for name, factor in factors.items()}
-    return accuracy(Rollout(attributes, *runs.values(), flow, {
-        "kolmogorov_time": 0.15, "filter_width": np.pi / 6.0}, spectra, gradients))
+    run = Rollout(attributes, *runs.values(), flow, {"kolmogorov_time": 0.15, "filter_width": np.pi / 6.0}, spectra,
+                  gradients)
+    return measures(run, None)[0]["accuracy"]
 
 
 def test_the_truth_itself_has_no_error():

@@ -86,20 +86,19 @@ def test_the_section_has_notices_summary_notes_figure_and_table():
     assert part.notices == ["sph (at 0.37 T): stopped: step 9, rank 0", "refused: failed: too few slabs"]
     assert all(text in part.text for text in (*TABLE.summary, "A note."))
     assert [figure.name for figure in part.illustrations] == ["error-against-run-time"]
-    assert [metric.label for metric in part.metrics] == [r["name"] for r in ROWS]
-    assert part.metrics[0].value["seconds a turnover"] == 20.0
-    assert list(part.metrics[0].value) == list(COLUMNS.values()) and len(COLUMNS) < 8
+    assert [label for label, *_ in part.table[1:]] == [r["name"] for r in ROWS]
+    assert part.columns["seconds a turnover"]["learned"] == 20.0
+    assert part.table[0][1:] == list(COLUMNS.values()) and len(COLUMNS) < 8
 
 
 def test_weights_without_their_cost_differ_from_methods_without_weights():
     rows = [{**ROWS[0], "weights": 7}, {**ROWS[1], "weights": 7, "training_seconds": 2.5}, ROWS[2]]
-    shown = [metric.value["training (s)"] for metric in section(table_of(rows)).metrics]
-    assert shown == ["not stored", 2.5, ""]
+    assert [*section(table_of(rows)).columns["training (s)"].values()] == ["not stored", 2.5, ""]
 
 
 def test_one_variant_has_a_row_and_no_figure():
     part = section(table_of(ROWS[:1]))
-    assert not part.illustrations and len(part.metrics) == 1
+    assert not part.illustrations and len(part.table) == 2
 
 
 def test_rows_without_a_time_say_why():
@@ -134,5 +133,4 @@ def test_spreads_are_bars_and_in_the_table():
     bars = [bar.get_segments()[0][:, 1] for container in scatter(table, ["velocity_error_early"]).axes[0].containers
             for bar in container.lines[2][1:]]
     assert bars[0].tolist() == pytest.approx([0.06, 0.14]) and bars[1].tolist() == pytest.approx([0.5, 0.5])
-    shown = [metric.value["velocity error at t_η"] for metric in section(table).metrics]
-    assert shown == ["0.1 ± 0.04", 0.5]
+    assert [*section(table).columns["velocity error at t_η"].values()] == ["0.1 ± 0.04", 0.5]

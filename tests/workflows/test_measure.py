@@ -3,12 +3,15 @@
 import logging
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
 
 from eddies.io.hdf5 import ProductError, open_product
+from eddies.stored_run import open_run
 from eddies.workflows import measure
+from eddies.workflows.measure import AXES
 from eddies.workflows.rollout import particle_measures
 from tests.changed_product import changed
 from tests.workflows.synthetic_run import write_kernel, write_rollout, write_run
@@ -55,13 +58,63 @@ def test_numbers_and_tables_of_a_forced_rollout(comm, directory):
         assert rollout[key] == accuracy[key]
     assert forced["energy"]["model"] > 0 and forced["qr_kl"] > 0
     # Three times of PDFs and spectra, four of planes, and all common frames of the errors.
-    assert [len(tables[name]["time"]) for name in ("pdfs", "spectra", "planes", "errors", "model")] == [3, 3, 4, 6, 9]
+    assert [len(tables[name]["time"]) for name in ("velocity_pdfs", "spectra", "planes", "errors", "model")] == [
+        3, 3, 4, 6, 9]
     for column in ("velocity", "acceleration"):
-        assert tables["pdfs"][f"{column}_model"].sum(axis=1) == pytest.approx(1)
-        assert tables["pdfs"][f"{column}_kl"][-1] == rollout[f"{column}_kl"]
-    assert tables["planes"]["velocity_truth"].dtype == np.float32 and tables["invariant_rates"]["count_model"].sum() > 0
-    assert set(tables) >= {"truth", "flow_spectra", "paths_model", "paths_truth", "distances", "invariants",
-                           "forced_spectra", "forced_accelerations"}
+        assert tables[f"{column}_pdfs"]["model"].sum(axis=1) == pytest.approx(1)
+        assert tables["errors"][f"{column}_kl"][-1] == rollout[f"{column}_kl"]
+    assert tables["planes"]["u_x_truth"].dtype == np.float32
+    cells = [np.ptp(tables["invariants"][name]) / (tables["invariants"][name].size - 1) for name in ("second", "third")]
+    assert [tables["invariants"][of].sum() * np.prod(cells) for of in ("model", "truth")] == pytest.approx([1, 1])
+    assert np.isfinite(tables["invariant_rates"]["second_rate_model"]).any()
+    assert tables.keys() - AXES.keys() == {"model", "truth", "errors"} and AXES.keys() <= tables.keys()
+
+
+@pytest.mark.mpi(1)
+def test_measures_are_read_with_axes_and_units(comm, directory):
+    measure.run(directory, comm)
+    run = open_run(directory)
+    assert "measures" in run.products
+    for group, column, axes, units in (
+            ("errors", "velocity_error", ("time",), None), ("velocity_pdfs", "model", ("time", "bin"), None),
+            ("model", "energy", ("time",), "L^2/T^2"), ("spectra", "energy_model", ("time", "wavenumber"), "L^2/T^2"),
+            ("planes", "u_x_truth", ("time", "y", "x"), "L/T"), ("invariants", "truth", ("second", "third"), None),
+            ("increments_model", "structure", ("lag",), "L^2/T^2"), ("paths_truth", "pair_dispersion", ("time",), None),
+            ("paths_truth", "tetrad_shape", ("time", "eigenvalue"), None)):
+        array = run[f"measures/{group}"][column]
+        assert array.dims == axes and array.attrs.get("units") == units, (group, column)
+    assert run["measures/planes"]["time"].attrs["units"] == "T" and run["measures/planes"].sizes["time"] == 4
+
+
+@pytest.mark.mpi(1)
+def test_numbers_of_a_known_rollout(comm, tmp_path):
+    """The model is the truth plus an error of 0.4 t times an independent flow of the same energy."""
+    write_run(comm, tmp_path, total=3000)
+    rollout = measured(tmp_path, comm)[0]["rollout"]
+    assert rollout["stable"] is True
+    assert rollout["last_common_time"] == pytest.approx(0.5 / 1.2)
+    assert rollout["velocity_error"] == pytest.approx(0.2, rel=0.15)
+    assert rollout["energy_ratio"] == pytest.approx(1.04, abs=0.05)
+    # The truth ends before half a turnover. Without any force its particles would keep their first velocities.
+    assert rollout["early_time"] == rollout["last_common_time"]
+    assert rollout["early_velocity_error"] == rollout["velocity_error"]
+    with h5py.File(tmp_path / "ground_truth.h5") as file:
+        velocity = file["particles/tracers/velocity/value"][6:12]
+        apart, energy = ((velocity[0] - velocity[-1]) ** 2).mean(), velocity.astype(float).var(axis=1).mean(axis=1)
+    assert rollout["early_velocity_error_no_force"] == pytest.approx((apart / energy[-1]) ** 0.5, rel=1e-5)
+    assert rollout["energy_ratio_no_force"] == pytest.approx(energy[0] / energy[-1], rel=1e-5)
+    assert rollout["filter_wavenumber"] == pytest.approx(4)
+    assert set(rollout["band_energy_ratios"]) == set(rollout["band_energy_ratios_floor"]) == {"1-2", "3-4"}
+    assert rollout["outside_training"] == pytest.approx(0.2e-3)  # at t = 0.4 or 0.5
+    assert (rollout["closure_iterations"], rollout["closure_most_iterations"]) == (2.5, 40)
+    assert 0 < rollout["velocity_kl"] < 0.1 and 0 < rollout["qr_kl"] < 0.5
+    # Both start at the same random points.
+    assert 0 < rollout["nearest_distance_kl"] < 0.1
+    # Random points in 64 cells.
+    assert all(value == pytest.approx(1, abs=0.5) for value in rollout["count_variance"].values())
+    # The model's error is a sum of random modes, with a mean over 600 particles. The truth has a sampling error only.
+    assert 0 < rollout["momentum_drift"]["truth"] < rollout["momentum_drift"]["model"] < 0.2
+    assert all(abs(value) < 1e-2 for value in rollout["density_drift"].values())
 
 
 @pytest.mark.mpi(1)

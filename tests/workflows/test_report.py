@@ -7,17 +7,16 @@ import subprocess
 import sys
 from dataclasses import replace
 
-import h5py
 import pytest
 from mpi4py import MPI
 
 from eddies import cli
 from eddies.io.hdf5 import ProductError
+from eddies.measures import MEASURES
 from eddies.parallel.stop import Stopped
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import dns, report
 from eddies.workflows.diff import numbers_of
-from eddies.workflows.product_warnings import old_products
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 from eddies.workflows.status import status_lines
 from tests.changed_product import changed
@@ -84,7 +83,7 @@ def test_a_complete_run_shows_everything(comm, tmp_path):
         assert all(math.isfinite(value) for value in numbers(metrics[section].values()))
         assert all(metrics[section][key] is not None for key in keys)
     assert "the model, terms pressure, pairs" in page
-    assert "not defined for the terms pressure, pairs in this flow" in page
+    assert "not available: not defined for the terms of this model in this flow" in page
     assert page.index('id="rollouts"') < page.index('id="models"') < page.index('id="ground_truth"')
     check_stationary(metrics["stationary"], page)
 
@@ -134,76 +133,16 @@ def test_a_span_too_short_to_average_has_a_notice_and_the_rest_is_shown(comm, tm
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_numbers_of_a_known_rollout(comm, tmp_path):
-    """The model is the truth plus an error of 0.4 t times an independent flow of the same energy."""
-    write_run(comm, tmp_path, total=3000)
+def test_forced_rollouts_are_compared_with_the_stationary_state_if_there_is_one(comm, tmp_path):
+    write_run(comm, tmp_path, {"stationary": True, "forced": True}, injection_rate=0.5, truth_injection_rate=0.5)
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
-    rollout = metrics["rollouts"]
-    assert rollout["stable"] is True
-    assert rollout["last_common_time"] == pytest.approx(0.5 / 1.2)
-    assert rollout["velocity_error"] == pytest.approx(0.2, rel=0.15)
-    assert rollout["energy_ratio"] == pytest.approx(1.04, abs=0.05)
-    # The truth ends before half a turnover. Without any force its particles would keep their first velocities.
-    assert rollout["early_time"] == rollout["last_common_time"]
-    assert rollout["early_velocity_error"] == rollout["velocity_error"]
-    with h5py.File(tmp_path / "ground_truth.h5") as file:
-        velocity = file["particles/tracers/velocity/value"][6:12]
-        apart, energy = ((velocity[0] - velocity[-1]) ** 2).mean(), velocity.astype(float).var(axis=1).mean(axis=1)
-    assert rollout["early_velocity_error_no_force"] == pytest.approx((apart / energy[-1]) ** 0.5, rel=1e-5)
-    assert rollout["energy_ratio_no_force"] == pytest.approx(energy[0] / energy[-1], rel=1e-5)
-    assert rollout["filter_wavenumber"] == pytest.approx(4)
-    assert set(rollout["band_energy_ratios"]) == set(rollout["band_energy_ratios_floor"]) == {"1-2", "3-4"}
-    assert rollout["outside_training"] == pytest.approx(0.2e-3)  # at t = 0.4 or 0.5
-    assert (rollout["closure_iterations"], rollout["closure_most_iterations"]) == (2.5, 40)
-    assert "1 solves for the resolved velocity did not converge" in page and "1.0e-03" in page
-    assert 0 < rollout["velocity_kl"] < 0.1 and 0 < rollout["qr_kl"] < 0.5
-    # Both start at the same random points.
-    assert 0 < rollout["nearest_distance_kl"] < 0.1
-    # Random points in 64 cells.
-    assert all(value == pytest.approx(1, abs=0.5) for value in rollout["count_variance"].values())
-    # The model's error is a sum of random modes, with a mean over 600 particles. The truth has a sampling error only.
-    assert 0 < rollout["momentum_drift"]["truth"] < rollout["momentum_drift"]["model"] < 0.2
-    assert all(abs(value) < 1e-2 for value in rollout["density_drift"].values())
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_a_forced_rollout_is_compared_with_the_stationary_state(comm, tmp_path):
-    write_run(comm, tmp_path, {"stationary": True}, injection_rate=0.5)
-    report.run(tmp_path, comm)
-    metrics, page = written(tmp_path)
-    assert "The model is forced with a power of 0.5 per mass, and the flow of the true tracers is not forced" in page
-    assert "forced" in figures(tmp_path)
+    assert "It stays forced with a power of 0.5 per mass" in page and "forced" in figures(tmp_path)
     assert all(math.isfinite(value) for value in numbers(metrics["forced"].values()))
     write_run(comm, tmp_path, injection_rate=0.5)
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
-    assert "two different flows" in page and not metrics["forced"]
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_a_rollout_with_the_forcing_of_its_truth_is_compared_with_both(comm, tmp_path):
-    write_run(comm, tmp_path, {"stationary": True, "forced": True}, injection_rate=0.5, truth_injection_rate=0.5)
-    report.run(tmp_path, comm)
-    _, page = written(tmp_path)
-    assert "different flows" not in page
-    assert "It stays forced with a power of 0.5 per mass" in page and "forced" in figures(tmp_path)
-    write_rollout(comm, tmp_path, truth_injection_rate=0.5)
-    report.run(tmp_path, comm)
-    _, page = written(tmp_path)
-    assert "The model is not forced, and the flow of the true tracers is forced with a power of 0.5" in page
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_a_stopped_rollout_is_compared_until_it_broke(comm, tmp_path):
-    write_run(comm, tmp_path, status="stopped: particle 17 is not finite at t=0.62", broken=4)
-    report.run(tmp_path, comm)
-    metrics, page = written(tmp_path)
-    assert "stopped: particle 17 is not finite at t=0.62" in page
-    assert "not finite from 0.333 T on" in page
-    assert metrics["rollouts"]["stable"] is False
-    assert metrics["rollouts"]["last_common_time"] == pytest.approx(0.3 / 1.2)
-    assert all(math.isfinite(value) for value in numbers(metrics["rollouts"].values()))
+    assert "two different flows" in page and not metrics["forced"] and "forced" not in figures(tmp_path)
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -216,33 +155,21 @@ def test_a_rollout_that_breaks_at_once_is_not_compared(comm, tmp_path):
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_a_model_that_integrates_density(comm, tmp_path):
-    write_model(comm, tmp_path, terms=("pairs", "density-flux"))
-    report.run(tmp_path, comm)
-    metrics, _ = written(tmp_path)
-    assert metrics["models"]["density_rate_error"] == pytest.approx(0.63)
-    assert metrics["models"]["delay"] == pytest.approx(0.6)
+def test_models_are_shown_with_their_source_and_the_flows_of_their_training(comm, tmp_path):
+    def models(**own):
+        write_model(comm, tmp_path, **own)
+        report.run(tmp_path, comm)
+        return written(tmp_path)[0]["models"]
 
-
-@pytest.mark.usefixtures("no_figures")
-def test_a_model_of_another_flow_is_shown_beside_its_source(comm, tmp_path):
-    write_model(comm, tmp_path, source={"path": "runs/other", "mach_turbulent": 0.08})
-    report.run(tmp_path, comm)
-    metrics, _ = written(tmp_path)
+    alone = models(terms=("pairs", "density-flux"))
+    assert (alone["density_rate_error"], alone["delay"]) == pytest.approx((0.63, 0.6))
     # Errors 0.24 + 0.03 t of this flow, at t = 0.1 to 0.6; the source's are 0.9 of them, and so are its times.
-    assert metrics["models"]["unseen_acceleration_error"] == pytest.approx(0.2505)
-    assert metrics["models"]["source_acceleration_error"] == pytest.approx(0.9 * 0.2505)
-    assert (metrics["models"]["source_mach_turbulent"], metrics["models"]["mach_turbulent"]) == (0.08, 0.16)
-    write_model(comm, tmp_path, source={"path": "runs/other", "mach_turbulent": None})
-    report.run(tmp_path, comm)
-    assert written(tmp_path)[0]["models"]["source_mach_turbulent"] is None
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_the_flows_that_weights_were_trained_on_are_named(comm, tmp_path):
-    write_model(comm, tmp_path, source={"path": "runs/other", "truths": {"runs/a/ground_truth.h5": 0.04,
-                                                                         "runs/b/ground_truth.h5": None}})
-    report.run(tmp_path, comm)
+    found = models(source={"path": "runs/other", "mach_turbulent": 0.08})
+    assert (found["unseen_acceleration_error"], found["source_acceleration_error"]) == pytest.approx(
+        (0.2505, 0.9 * 0.2505))
+    assert (found["source_mach_turbulent"], found["mach_turbulent"]) == (0.08, 0.16)
+    assert models(source={"path": "runs/other", "mach_turbulent": None})["source_mach_turbulent"] is None
+    models(source={"path": "runs/other", "truths": {"runs/a/ground_truth.h5": 0.04, "runs/b/ground_truth.h5": None}})
     assert ("trained on runs/a/ground_truth.h5 (M_t = 0.040), runs/b/ground_truth.h5, and not on the flow of "
             "runs/other") in written(tmp_path)[1]
 
@@ -308,6 +235,32 @@ def test_a_rollout_without_its_ground_truth(comm, tmp_path):
     assert metrics["rollouts"]["velocity_error"] is metrics["rollouts"]["spectrum_error"] is None
     assert "not compared with the truth: ground_truth.h5 is not here" in page
     assert metrics["rollouts"]["turnovers"] > 0 and not figures(tmp_path)
+    with changed(tmp_path / "rollout.h5") as file:
+        del file["rollout"].attrs["seconds_per_step"], file["rollout"].attrs["time_step"]
+    (tmp_path / "measures.h5").unlink()
+    report.run(tmp_path, comm)
+    metrics, page = written(tmp_path)
+    assert metrics["rollouts"]["seconds_per_step"] is None and metrics["rollouts"]["particles"] == 600
+    assert "not available: too few steps to time" in page
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_only_a_grid_as_fine_as_that_of_the_simulation_repeats_it(comm, tmp_path):
+    """The direct simulation has 24 cells. A coarser grid is faster."""
+    grid, seconds = 'simulation.method = "eulerian"', {"plain": 1.0, "coarse": 2.0, "fine": 5.0}
+    scene = scene_of(tmp_path, ("coarse", grid), ("fine", grid, "eulerian.cells = 24"))
+    variants = {name: [tmp_path / name] for name in seconds}
+    measures = {tmp_path / name: ({
+        "ranks": 1, "accuracy": dict.fromkeys([*MEASURES, "end"], 0.5), "attributes": {
+            "status": "complete", "time_step": 1.0, "eddy_turnover_time": 1.0,
+            **{f"seconds_per_step{end}": time for end in ("", "_low", "_high")}}}, {})
+        for name, time in seconds.items()}
+    for where, in variants.values():
+        where.mkdir()
+        (where / "rollout.h5").touch()
+    made = report.Report(tmp_path, scene, variants)
+    report._compare(made, measures, 7.0, 1, comm)
+    assert made.numbers["simulation_seconds"] == 5.0
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -387,27 +340,6 @@ def test_a_rollout_of_other_settings_is_left_out_of_the_comparison(comm, tmp_pat
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_files_that_are_not_found_from_here_make_no_product_old(comm, tmp_path, monkeypatch):
-    """A stored scene may name them relative to another working directory."""
-    there, here = tmp_path / "there", tmp_path / "here"
-    for folder in (there, here):
-        folder.mkdir()
-    (there / "start.h5").write_text("state")
-    monkeypatch.chdir(there)
-    scene = one_model("tiny", ["initial.kind=file", "initial.path=start.h5"],
-                      ["initial.amplitude", "initial.peak_wavenumber"])
-    write_run(comm, tmp_path / "run")
-    (tmp_path / "run/scene.toml").write_text(scene.to_toml())
-    for product, stage in (("ground_truth", "dns"), ("rollout", "simulate")):
-        with changed(tmp_path / f"run/{product}.h5") as file:
-            origin = json.loads(file.attrs["provenance"]) | stage_provenance(scene, stage) | {"made_from": {}}
-            file.attrs["provenance"] = json.dumps(origin)
-    monkeypatch.chdir(here)
-    assert old_products(scene, tmp_path / "run").keys() == {tmp_path / "run/kernel.h5", tmp_path / "run/model.h5"}
-    assert any("not found from here" in line for line in status_lines(tmp_path / "run"))
-
-
-@pytest.mark.usefixtures("no_figures")
 def test_a_rollout_within_the_training_of_its_model_is_named_at_the_top(comm, tmp_path, capfd):
     write_run(comm, tmp_path)
     scene = one_model("tiny", ["simulation.start=0.1"])
@@ -450,17 +382,6 @@ def test_a_ground_truth_that_is_not_finite_is_refused(comm, tmp_path):
         file["fields/filtered/velocity"][0, 0, 0, 0, 0] = math.nan
     with pytest.raises(ProductError, match="ground_truth.h5: /fields/filtered/velocity, frame 0: .*not finite"):
         report.run(tmp_path, comm)
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_a_rollout_of_too_few_steps_has_no_time_of_a_step(comm, tmp_path):
-    write_rollout(comm, tmp_path)
-    with changed(tmp_path / "rollout.h5") as file:
-        del file["rollout"].attrs["seconds_per_step"], file["rollout"].attrs["time_step"]
-    report.run(tmp_path, comm)
-    metrics, page = written(tmp_path)
-    assert metrics["rollouts"]["seconds_per_step"] is None and metrics["rollouts"]["particles"] == 600
-    assert "not available: too few steps to time" in page
 
 
 @pytest.mark.usefixtures("no_figures")

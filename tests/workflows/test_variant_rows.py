@@ -1,5 +1,6 @@
 """Rows of the table of variants, and the notes on them."""
 
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -49,7 +50,7 @@ def test_numbers_of_another_kernel_are_left_out(tmp_path, change):
                               dict.fromkeys(scene.variant, [REALISED]), None)
     assert [{measure for measure in MEASURES if row[measure] is None} for row in rows] == [
         set(), set(), set(THROUGH_KERNEL)]
-    _, note = notes((), different, {}, {})
+    _, note = notes((), different, {})
     assert note.startswith("own: no ") and all(MEASURES[name] in note for name in THROUGH_KERNEL)
 
 
@@ -68,16 +69,18 @@ def test_a_turnover_costs_as_much_as_its_steps():
 
 
 def test_a_note_says_how_many_flows_the_numbers_are_of():
-    (one,), (several,) = notes((), [], {}, {}), notes((2, 5), [], {}, {})
+    (one,), (several,) = notes((), [], {}), notes((2, 5), [], {})
     assert "one realisation" in one and "2 realisations, seeds 2, 5" in several
 
 
-def test_notes_on_the_wavenumbers_that_grids_keep_and_on_different_particles():
-    tracers = {name: load_scene(TINY).tracers for name in ("grid-18", "grid-16", "plain")}
+def test_notes_on_the_wavenumbers_that_grids_keep_and_on_different_particles(tmp_path):
+    grids = [(f"grid-{cells}", 'simulation.method = "eulerian"', f"eulerian.cells = {cells}") for cells in (18, 16)]
+    variants = scene_of(tmp_path, *grids).variant
     # A grid of 18 cells does not keep the mode 18/3 = 6.
-    _, note = notes((), [], tracers, {"grid-18": 18, "grid-16": 16, "plain": 0})
+    _, note = notes((), [], variants)
     assert "5 in grid-18, 5 in grid-16; the filter wavenumber k_d = pi/d is 3." in note
-    *_, note = notes((), [], tracers | {"few": tracers["plain"].with_count(27)}, {})
+    few = replace(variants["plain"], tracers=variants["plain"].tracers.with_count(27))
+    *_, note = notes((), [], {**variants, "few": few})
     assert note.startswith("Variants have different particles")
 
 

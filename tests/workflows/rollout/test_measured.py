@@ -1,13 +1,11 @@
-"""A rollout and its truth, with measures that are made when they are used."""
+"""A rollout and its truth, and the series that are computed from both."""
 
 import numpy as np
 import pytest
 
-from eddies.analysis.accuracy import accuracy
 from eddies.io.hdf5 import open_product
 from eddies.io.trajectories import Trajectory
 from eddies.workflows.rollout.measured import TrueParticles, open_rollout
-from tests.workflows.counting import count_measures
 from tests.workflows.synthetic_run import START, write_run
 
 
@@ -18,18 +16,6 @@ def directory(comm, tmp_path):
         write_run(comm.Create_group(comm.group.Incl([0])), tmp_path, {"stationary": True}, injection_rate=0.5)
     comm.Barrier()
     return tmp_path
-
-
-@pytest.fixture
-def work(monkeypatch):
-    """A list of all measures that are made, as pairs of "model" or "truth" and frame."""
-    done = []
-
-    def noted(quantity, particles, frame):
-        done.append(("truth" if isinstance(particles, TrueParticles) else "model", frame))
-
-    count_measures(monkeypatch, noted)
-    return done
 
 
 @pytest.mark.mpi(1)
@@ -51,28 +37,21 @@ def test_the_true_particles_are_those_of_the_ground_truth_at_the_times_of_the_ro
 
 
 @pytest.mark.mpi(1)
-def test_accuracy_needs_no_more_than_the_last_frame(comm, directory, work):
-    with open_rollout(directory, comm) as measured:
-        found = accuracy(measured.rollout)
-        assert sorted(work) == [("model", 5), ("truth", 5)]
-        assert found["qr_kl"] > 0 and found["velocity_error_end"] > 0
-        # The flow's spectrum is stored for every other frame, and not for this one.
-        assert found["spectrum_error"] is None
-
-
-@pytest.mark.mpi(1)
-def test_without_ground_truth_or_kernel_there_are_fewer_measures(comm, directory):
-    with open_rollout(directory, comm) as measured:
-        assert set(measured.groups) == {"particles/truth", *(f"{what}{of}" for of in ("model", "truth") for what in (
+def test_without_ground_truth_or_kernel_there_are_fewer_series(comm, directory):
+    with open_rollout(directory, comm) as stored:
+        groups = stored.groups()
+        assert set(groups) == {"particles/truth", *(f"{what}{of}" for of in ("model", "truth") for what in (
             "spectra_of_", "fields/", "gradients/"))}
-        assert measured.exported["particles"]["model"].read(0, "velocity_gradient").shape == (600, 3, 3)
+        assert stored.particles["model"].read(0, "velocity_gradient").shape == (600, 3, 3)
+        times, columns = groups["fields/truth"]
+        assert columns["velocity"](0).shape[0] == 3 and len(times) == 6
+        assert "velocity_gradient" not in groups["particles/truth"][1]
     (directory / "kernel.h5").unlink()
-    with open_rollout(directory, comm) as measured:
-        assert measured.rollout.invariants is None and measured.exported["fields"] == {}
-        assert set(measured.groups) == {"particles/truth", "spectra_of_model", "spectra_of_truth"}
-        assert accuracy(measured.rollout)["qr_kl"] is None
+    with open_rollout(directory, comm) as stored:
+        assert stored.rollout.invariants is stored.rollout.planes is None and not stored.fields
+        assert set(stored.groups()) == {"particles/truth", "spectra_of_model", "spectra_of_truth"}
     (directory / "ground_truth.h5").unlink()
-    with open_rollout(directory, comm) as measured:
-        assert measured.groups == {} and list(measured.exported["particles"]) == ["model"]
+    with open_rollout(directory, comm) as stored:
+        assert stored.groups() == {} and list(stored.particles) == ["model"]
         with pytest.raises(ValueError, match="ground_truth.h5 is not here"):
-            measured.rollout.common
+            stored.rollout.common
