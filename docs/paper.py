@@ -22,9 +22,9 @@ from eddies import open_run
 from eddies.analysis.pdfs import bin_edges, bin_probabilities, gaussian, kl_divergence, pdf, standardized
 from eddies.flow.statistics import energy_spectrum
 from eddies.parallel.slab import SlabDecomposition
-from eddies.report.figures import (DNS, FILTERED, GUIDE, LOOKS, OTHERS, TRUTH, guide_power_law, legend_at_foot, letter,
-                                   note, number_wavenumbers, panels, png, styled)
-from eddies.report.rollout_figures import (Drawn, invariant_planes, particle_pdfs, velocity_planes,
+from eddies.report.figures import (DNS, FILTERED, GUIDE, LOOKS, OTHERS, TRUTH, Variant, guide_power_law,
+                                   legend_at_foot, letter, mark_cutoff, number_wavenumbers, panels, png, styled)
+from eddies.report.rollout_figures import (invariant_planes, particle_pdfs, turnover_of, velocity_planes,
                                            vorticity_and_energy)
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.stored_run import StoredRun
@@ -62,7 +62,7 @@ def numbers_of(run: StoredRun) -> dict:
 @styled
 def figure_3(numbers: dict[str, dict]):
     """Draw errors at the true state over delay and Mach number, and PDFs of the acceleration."""
-    figure, axes = panels(2, 3, (3.6, 2.9), foot=0.3)
+    figure, axes = panels(2, 3, (3.6, 2.9))
     delay, machs, *shown = axes.flat
     training = numbers["training"]
     for name in training["models"]:
@@ -89,48 +89,46 @@ def figure_3(numbers: dict[str, dict]):
                  ylabel="PDF")
     for axis in shown[len(numbers):]:
         axis.remove()
-    legend_at_foot(figure, delay, 4)
+    legend_at_foot(figure, delay)
     letter([*axes.flat][:2 + len(numbers)])
     return figure
 
 
-def drawn(run: Path, names: list[str]) -> dict[str, Drawn]:
+def drawn(run: Path, names: list[str]) -> list[Variant]:
     """The measures of variants of a run, which are made if they are missing."""
     for name in names:
         measure.update(run / name, MPI.COMM_SELF)
-    return {name: Drawn(*MODELS[name], *measure.read(run / name, MPI.COMM_SELF)) for name in names}
+    return [Variant(*MODELS[name], *measure.read(run / name, MPI.COMM_SELF)) for name in names]
 
 
 @styled
-def figure_8(rows: list[tuple[str, dict[str, Drawn], dict[str, StoredRun]]]):
+def figure_8(rows: list[tuple[str, list[Variant], list[StoredRun]]]):
     """Draw energy spectra at the start, the middle and the end; a row for each flow.
 
     Spectra of particles are those of the field that the learned kernel reconstructs, as in the paper.
     """
-    figure, axes = panels(len(rows), 3, (3.5, 3.1), foot=0.3, sharex=True, sharey=True)
+    figure, axes = panels(len(rows), 3, (3.5, 3.1), sharex=True, sharey=True)
     for row, (title, rollouts, stored) in zip(axes, rows):
-        first = next(iter(rollouts.values()))
-        flow, cutoff = first.tables["flow_spectra"], first.numbers["rollout"]["filter_wavenumber"]
+        flow, cutoff = rollouts[0].tables["flow_spectra"], rollouts[0].numbers["rollout"]["filter_wavenumber"]
         known = flow["wavenumber"] >= 1
         for number, (axis, time) in enumerate(zip(row, flow["time"])):
-            for column, line in (("energy", {"color": DNS, "linestyle": ":", "label": "DNS"}),
-                                 ("filtered", {"color": FILTERED, "label": "filtered DNS"})):
+            for column, line in (("energy_flow", {"color": DNS, "linestyle": ":", "label": "DNS"}),
+                                 ("energy_filtered", {"color": FILTERED, "label": "filtered DNS"})):
                 axis.loglog(flow["wavenumber"][known], flow[column][number][known], linewidth=1.2, **line)
-            draw_spectrum(axis, next(iter(stored.values())).field(time=time, of="truth"), cutoff, label="true tracers",
+            draw_spectrum(axis, stored[0].field(time=time, of="truth"), cutoff, label="true tracers",
                           color=TRUTH)
-            for name, run in stored.items():
-                draw_spectrum(axis, run.field(time=time, of="model"), cutoff, **rollouts[name].line())
-            axis.axvline(cutoff, color=GUIDE, linestyle=":", linewidth=1)
-            note(axis, r"$\pi/d$", (cutoff, 0.01), ("data", "axes fraction"), (3, 1))
-            axis.set_title(f"{title}, $t = {time / first.turnover:.2f}\\,T$")
+            for each, run in zip(rollouts, stored):
+                draw_spectrum(axis, run.field(time=time, of="model"), cutoff, **each.line(each.tables["spectra"]))
+            mark_cutoff(axis, cutoff)
+            axis.set_title(f"{title}, $t = {time / turnover_of(rollouts):.2f}\\,T$")
             number_wavenumbers(axis)
         row[0].set_ylabel("$E(k)$")
     for axis in axes[-1]:
         axis.set_xlabel("wavenumber $k$")
-    peak = max(flow["energy"].max(axis=0))
+    peak = max(flow["energy_flow"].max(axis=0))
     guide_power_law(axes[0, 0], (2, 10), 2.2 * peak, -5 / 3, r"$k^{-5/3}$")
     axes[0, 0].set(ylim=(1e-5 * peak, 6 * peak), xlim=(0.9, 85))
-    legend_at_foot(figure, axes[0, 0], 7)
+    legend_at_foot(figure, axes[0, 0])
     letter(axes.flat)
     return figure
 
@@ -173,7 +171,7 @@ def main(arguments: list[str]) -> None:
     for number, draw in ((4, velocity_planes), (5, vorticity_and_energy), (6, particle_pdfs), (7, invariant_planes)):
         save(HERE / f"figure-{number}.png", draw(rollouts["mt016"]))
     save(HERE / "figure-8.png", figure_8([(f"$M_t = {mach_number(runs[name]):.2f}$", found,
-                                           {variant: runs[name].variant(variant) for variant in MODELS})
+                                           [runs[name].variant(variant) for variant in MODELS])
                                           for name, found in rollouts.items()]))
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eddies.analysis.rollout import CommonFrames, Rollout
+from eddies.analysis.rollout import Rollout, spread
 
 SHELLS, CELLS = np.arange(6), 12
 
@@ -58,8 +58,7 @@ def test_common_frames_before_the_model_broke():
     for alone in (rollout(broken=0), rollout(truth=(7.0,))):
         with pytest.raises(ValueError, match="no time at which"):
             alone.common
-    spread = CommonFrames.of(Still(range(9)), Still(range(9))).spread(3)
-    assert spread.tolist() == [0, 4, 8]
+    assert spread(np.arange(9), 3).tolist() == [0, 4, 8] and spread(np.arange(2), 3).tolist() == [0, 1]
 
 
 @pytest.mark.parametrize("unit", [1e-9, 1e9])

@@ -11,7 +11,7 @@ from eddies.io.weights import save_weights
 from eddies.measures import MEASURES
 from eddies.scene.scene import load_scene
 from eddies.workflows.variant_rows import (BEFORE, BREAK_EVEN, SEARCH, THROUGH_KERNEL, add_break_even, before, combined,
-                                           missing_reason, notes, rows_of, simulation_seconds, step_costs)
+                                           missing_reason, notes, numbers, rows_of, simulation_seconds)
 from tests.small_scene import TINY
 
 HEAD = f'base = "{TINY}"\nsimulation.turnovers = 0.25\nkernel.steps = 50\n'
@@ -62,10 +62,14 @@ def test_a_variant_without_a_rollout_says_why(tmp_path):
 
 
 def test_a_turnover_costs_as_much_as_its_steps():
-    rollout = {"seconds_per_step": 0.3, "seconds_per_step_low": 0.2, "seconds_per_step_high": 0.5, "time_step": 0.1}
-    found = step_costs(rollout, turnover=2.0, ranks=3)
+    rollout = {"seconds_per_step": 0.3, "seconds_per_step_low": 0.2, "seconds_per_step_high": 0.5, "time_step": 0.1,
+               "eddy_turnover_time": 2.0, "status": "complete"}
+    found = numbers({"attributes": rollout, "ranks": 3, "accuracy": {"velocity_kl": 0.5}})
     assert [found[f"wall_seconds{end}"] for end in ("", "_low", "_high")] == pytest.approx([6.0, 4.0, 10.0])
     assert found["core_seconds"] == pytest.approx(18.0)
+    assert (found["stopped_at"], found["velocity_kl"]) == (None, 0.5)
+    stopped = numbers({"attributes": {"status": "stopped: here", "turnovers": 0.3}, "ranks": 3, "accuracy": {}})
+    assert stopped == {"status": "stopped: here", "ranks": 3, "stopped_at": 0.3, "time_step": None}
 
 
 def test_a_note_says_how_many_flows_the_numbers_are_of():

@@ -39,9 +39,9 @@ def error_series(run: Rollout) -> dict[str, np.ndarray]:
     frame. `velocity_kl` and `acceleration_kl` are values of `pdf_divergence`.
     """
     rows, first = [], run.pair(0, "velocity").truth
-    for index in range(run.common.times.size):
+    for index, time in enumerate(run.common.times):
         velocity, acceleration = run.pair(index, "velocity"), run.pair(index, "acceleration")
-        rows.append((velocity.time, velocity_error(velocity.model, velocity.truth),
+        rows.append((time, velocity_error(velocity.model, velocity.truth),
                      pdf_divergence(velocity, EDGES["velocity"]),
                      pdf_divergence(acceleration, EDGES["acceleration"]), velocity_error(first, velocity.truth)))
     names = ("time", "velocity_error", "velocity_kl", "acceleration_kl", "no_force")

@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -38,33 +38,17 @@ class Frames(Protocol):
         """Return the rows start, ..., stop - 1 of a column in a frame. Rows are particles in order of id."""
 
 
-@dataclass(frozen=True)
-class CommonFrames:
+class CommonFrames(NamedTuple):
     """Frames of model and truth at the same times: the frame numbers of both, and these times, each (m,)."""
 
     model: np.ndarray
     truth: np.ndarray
     times: np.ndarray
 
-    @classmethod
-    def of(cls, model: Frames, truth: Frames, until: float = np.inf) -> "CommonFrames":
-        """Pair the frames before `until` that have the `same_times`. Raises ValueError if there are none."""
-        rows, columns = same_times(model.times, truth.times)
-        early = model.times[rows] < until
-        if not early.any():
-            raise ValueError("there is no time at which model and truth both have finite values")
-        return cls(rows[early], columns[early], model.times[rows[early]])
 
-    def spread(self, count: int) -> np.ndarray:
-        """Return the indices of at most `count` common frames, evenly spread from the first to the last."""
-        return _spread(np.arange(self.times.size), count)
-
-
-@dataclass(frozen=True)
-class Pair:
+class Pair(NamedTuple):
     """One quantity of model and truth at one time."""
 
-    time: float
     model: np.ndarray
     truth: np.ndarray
 
@@ -158,10 +142,15 @@ class Rollout:
 
     @cached_property
     def common(self) -> CommonFrames:
-        """The common frames before the time `broken`. Raises ValueError, with the reason, if there are none."""
+        """The frames of both before the time `broken` that have the `same_times`. Raises ValueError, with the reason,
+        if there are none."""
         if not len(self.truth.times) and self.without_truth:
             raise ValueError(self.without_truth)
-        return CommonFrames.of(self.model, self.truth, self.broken)
+        model, truth = same_times(self.model.times, self.truth.times)
+        early = self.model.times[model] < self.broken
+        if not early.any():
+            raise ValueError("there is no time at which model and truth both have finite values")
+        return CommonFrames(model[early], truth[early], self.model.times[model[early]])
 
     def before_broken(self, of: str) -> np.ndarray:
         """Return the frame numbers before the time `broken`. `of` is "model" or "truth"."""
@@ -169,9 +158,8 @@ class Rollout:
 
     def pair(self, index: int, column: str) -> Pair:
         """Return a column of model and truth at the common frame `index`. Rows are particles in order of id."""
-        common = self.common
-        return Pair(float(common.times[index]), self.model.read(int(common.model[index]), column),
-                    self.truth.read(int(common.truth[index]), column))
+        return Pair(self.model.read(int(self.common.model[index]), column),
+                    self.truth.read(int(self.common.truth[index]), column))
 
     def both(self, measures: Mapping[str, Mapping[int, Any]], index: int) -> tuple[Any, Any]:
         """Return the values of model and truth at the common frame `index`; `measures` is, for example, `spectra`."""
@@ -189,7 +177,7 @@ class Rollout:
 
     def shown_spectra(self) -> np.ndarray:
         """Return at most SHOWN of the indices that `spectral` returns, evenly spread."""
-        return _spread(self.spectral(), SHOWN)
+        return spread(self.spectral(), SHOWN)
 
     def late_spectra(self) -> np.ndarray:
         """Return the frame numbers over which the spectrum of the model is averaged.
@@ -230,7 +218,7 @@ def second_half(times: np.ndarray, end: float) -> np.ndarray:
     return rows if rows.size else np.array([max(int(np.searchsorted(times, end, "right")) - 1, 0)])
 
 
-def _spread(values: np.ndarray, count: int) -> np.ndarray:
+def spread(values: np.ndarray, count: int) -> np.ndarray:
     """Return at most `count` of the values (m,), evenly spread from the first to the last."""
     return values[np.unique(np.rint(np.linspace(0, len(values) - 1, count)).astype(int))]
 

@@ -12,7 +12,7 @@ from eddies.analysis.forced import forced_averages
 from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.lagrangian import differences, of_both
 from eddies.analysis.pdfs import bin_centres, bin_probabilities, kl_divergence, standardized
-from eddies.analysis.rollout import SHOWN, Rollout
+from eddies.analysis.rollout import SHOWN, Rollout, spread
 from eddies.analysis.spectra import band_ratios, spectrum_error
 from eddies.measures import MEASURES
 
@@ -131,7 +131,7 @@ def _particles(run: Rollout) -> tuple[dict[str, Any], Tables]:
     numbers = {"energy_ratio": float(model[-1] / truth[-1]), "energy_ratio_no_force": float(truth[0] / truth[-1]),
                "velocity_error": float(errors["velocity_error"][-1]), "early_time": early / run.turnover,
                "early_velocity_error": early_error, "early_velocity_error_no_force": early_without}
-    chosen = common.spread(SHOWN)
+    chosen = spread(np.arange(len(common.times)), SHOWN)
     tables = {"errors": errors}
     for column, edges in EDGES.items():
         pairs = [run.pair(index, column) for index in chosen]
@@ -146,7 +146,7 @@ def _planes(run: Rollout) -> tuple[dict[str, Any], Tables]:
     """Return u_x, vorticity magnitude and kinetic energy in planes, in single precision, at up to PLANES times."""
     if run.planes is None:
         return {}, {}
-    chosen = run.common.spread(PLANES)
+    chosen = spread(np.arange(len(run.common.times)), PLANES)
     planes: dict[str, list[np.ndarray]] = {}
     for index in chosen:
         both = run.both(run.planes, index)

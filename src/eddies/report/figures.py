@@ -236,6 +236,12 @@ def legend_below(axis: Axes, columns: int) -> None:
                 handlelength=1.8)
 
 
+def mark_cutoff(axis: Axes, cutoff: float) -> None:
+    """Draw a vertical line at the filter wavenumber."""
+    axis.axvline(cutoff, color=GUIDE, linestyle=":", linewidth=1)
+    note(axis, r"$\pi/d$", (cutoff, 0.01), ("data", "axes fraction"), (3, 1))
+
+
 def mark_time(axis: Axes, time: float, label: str) -> None:
     """Draw a thin vertical line at a time, with a label at the top of the line."""
     axis.axvline(time, color=GUIDE, linewidth=1, linestyle=":")

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from eddies.report.figures import (BAR, BLUE, DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SECOND, SIGNED,
-                                   Table, colour_bar, guide_power_law, largest, legend_below, letter, mark_time, note,
-                                   number_wavenumbers, panels, show_plane, styled)
+from eddies.report.figures import (BAR, BLUE, DNS, FILTERED, FOURTH, MODEL, POSITIVE, SECOND, SIGNED,
+                                   Table, colour_bar, guide_power_law, largest, legend_below, letter, mark_cutoff,
+                                   mark_time, number_wavenumbers, panels, show_plane, styled)
 from eddies.report.page import Section
 
 # Panels of the history: title, axis label, and the columns with their labels, colours and line styles.
@@ -126,8 +126,7 @@ def energy_spectra(wavenumber: np.ndarray, energy: np.ndarray, filtered: np.ndar
     axis.loglog(k, spectrum, color=DNS, label="DNS", marker="o" if k.size < 8 else None)
     if filtered is not None:
         axis.loglog(k, filtered[inside], color=FILTERED, linestyle="--", label="filtered DNS")
-        axis.axvline(np.pi / filter_width, color=GUIDE, linestyle=":", linewidth=1)
-        note(axis, "$k_d$", (np.pi / filter_width, 0.02), ("data", "axes fraction"), (3, 2))
+        mark_cutoff(axis, np.pi / filter_width)
     guide = k[(k >= 2) & (k <= max(6, k.max() / 4))]
     if guide.size > 2:
         guide_power_law(axis, guide, 1.6 * spectrum[k == guide[0]][0], -5 / 3, r"$k^{-5/3}$")

@@ -9,18 +9,12 @@ from eddies.report.figures import (BAR, DNS, MODEL, SECOND, SIGNED, THIRD, colou
                                    show_plane, styled)
 from eddies.report.page import Section
 
-KERNELS = {  # name in the files: label, colour, line style
-    "learned": ("learned", MODEL, "-"),
-    "learned_no_gradient": (r"learned without $L_g$", THIRD, "--"),
-    "cubic_spline": ("cubic spline", DNS, "-."),
-    "wendland": ("Wendland C$^2$", SECOND, ":"),
-}
-ERRORS = {  # name of a reconstruction in the files: start of its keys in the report, name in words
-    "learned": ("", "learned kernel"),
-    "learned_no_gradient": ("no_gradient_", "learned without L_g"),
-    "cubic_spline": ("cubic_spline_", "cubic spline"),
-    "wendland": ("wendland_", "Wendland C²"),
-    "kriging": ("kriging_", "kriging, without a kernel"),
+KERNELS = {  # name in the files: start of its keys in the report, name in words, label, colour, line style
+    "learned": ("", "learned kernel", "learned", MODEL, "-"),
+    "learned_no_gradient": ("no_gradient_", "learned without L_g", r"learned without $L_g$", THIRD, "--"),
+    "cubic_spline": ("cubic_spline_", "cubic spline", "cubic spline", DNS, "-."),
+    "wendland": ("wendland_", "Wendland C²", "Wendland C$^2$", SECOND, ":"),
+    "kriging": ("kriging_", "kriging, without a kernel", "kriging", DNS, "-"),
 }
 
 
@@ -33,7 +27,7 @@ def shapes(kernels: Mapping[str, np.ndarray]) -> Figure:
     figure, axes = panels(1, 2, (4.4, 3.3))
     for axis, kind in zip(axes.flat, ("value", "derivative")):
         axis.axhline(0, color="#cccccc", linewidth=0.8)
-        for name, (label, colour, style) in KERNELS.items():
+        for name, (*_, label, colour, style) in KERNELS.items():
             if f"{kind}_{name}" in kernels:
                 axis.plot(kernels["r_over_h"], kernels[f"{kind}_{name}"], color=colour, linestyle=style,
                           label=label)
@@ -63,7 +57,7 @@ def reconstructed_planes(slices: Mapping[str, np.ndarray], errors: Mapping[str, 
         row[0].set(title="filtered DNS", ylabel="$y$")
         for axis, name in zip(row[1:], names):
             show_plane(axis, slices[f"{quantity}_{name}"], (-limit, limit), SIGNED)
-            axis.set_title(f"{KERNELS[name][0]}: {float(errors[f'{quantity}_error_{name}']):.3f}")
+            axis.set_title(f"{KERNELS[name][2]}: {float(errors[f'{quantity}_error_{name}']):.3f}")
         colour_bar(figure, image, row, symbol)
     for axis in axes[-1]:
         axis.set_xlabel("$x$")
@@ -80,7 +74,7 @@ def section(support: float, kernels: Mapping[str, np.ndarray], slices: Mapping[s
     """
     numbers, labels = {"support": float(support), "integral": float(errors["integral_learned"])}, {
         "support": "support radius h", "integral": "integral of the learned kernel"}
-    for name, (start, words) in ERRORS.items():
+    for name, (start, words, *_) in KERNELS.items():
         for field in ("velocity", "gradient"):
             labels[f"{start}{field}_error"] = f"error of the {field} field, {words}"
             column = f"{field}_error_{name}"

@@ -17,7 +17,7 @@ from eddies.analysis.pdfs import bin_centres, gaussian
 from eddies.analysis.velocity_gradients import vieillefosse_line
 from eddies.clock import SAME
 from eddies.report.figures import (BAR, DNS, FILTERED, GUIDE, MODEL, POSITIVE, SIGNED, TRUTH, WIDE, Table, Variant,
-                                   colour_bar, guide_power_law, largest, legend_at_foot, letter, note,
+                                   colour_bar, guide_power_law, largest, legend_at_foot, letter, mark_cutoff, note,
                                    number_wavenumbers, panels, plain_log_ticks, show_plane, styled)
 
 TRUE = "true tracers"
@@ -175,12 +175,6 @@ def energy_spectra(variants: Variants) -> Figure:
     legend_at_foot(figure, axes[0, 0])
     letter(axes.flat)
     return figure
-
-
-def mark_cutoff(axis: Axes, cutoff: float) -> None:
-    """Draw a vertical line at the filter wavenumber."""
-    axis.axvline(cutoff, color=GUIDE, linestyle=":", linewidth=1)
-    note(axis, r"$\pi/d$", (cutoff, 0.01), ("data", "axes fraction"), (3, 1))
 
 
 @styled

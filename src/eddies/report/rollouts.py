@@ -20,32 +20,21 @@ METHODS = {
                 "velocity, closure: {closure}, started from the {start}",
 }
 LABELS = {
-    "method": "what moved the particles", "turnovers": "eddy turnovers of the rollout",
-    "two_flows": "model and truth are forced differently", "broken": "model is not finite from (T)",
-    "outside_training": "pairs outside the training range, largest share over time",
+    "method": "what moved the particles", "two_flows": "model and truth are forced differently",
+    "broken": "model is not finite from (T)", "outside_training": "pairs outside the training range, largest share",
     "closure_iterations": "iterations of a solve for the resolved velocity, mean",
     "closure_most_iterations": "iterations of a solve, maximum",
-    "closure_residual": "largest residual of a solve / rms velocity",
-    "closure_not_converged": "solves that did not converge", "last_common_time": "last common time / T",
+    "closure_residual": "largest residual of a solve / rms velocity", "last_common_time": "last common time / T",
     "energy_ratio_no_force": "energy, model / truth, for particles without any force",
-    "velocity_error": "velocity error by particle at the end (normalised L2)",
     "early_time": "early time / T (half a turnover, or the end if it is earlier)",
-    "early_velocity_error": "velocity error by particle at the early time",
-    "early_velocity_error_no_force": "the same error for particles without any force",
     "acceleration_rms_ratio": "rms of the acceleration, model / truth",
     "plane_difference": "relative difference of u_x in the last plane",
-    "filter_wavenumber": "filter wavenumber k_d = π/d",
+    "filter_wavenumber": "filter wavenumber k_d = π/d", "nearest_distance_kl": "KL nearest-neighbour distance",
     "band_energy_ratios": "energy of bands of wavenumbers, model / filtered flow",
-    "band_energy_ratios_floor": "the same ratios for the true tracers",
-    "nearest_distance_kl": "KL divergence of the nearest-neighbour distance PDF",
     "seconds_per_step": "seconds of a step (median, without storing)",
-    "storing_share": "share of the wall time that storing took",
-    "evaluations_per_turnover": "evaluations of the forces per turnover"}
-OF_FORCED = {
-    "energy": "kinetic energy", "acceleration_rms": "rms of an acceleration component",
-    "spectrum_error": "error of the mean spectrum", "true_energy": "kinetic energy, true tracers over the same time",
-    "true_acceleration_rms": "rms of an acceleration component, true tracers over the same time",
-    "average_from": "averages from (T)"}
+    "storing_share": "share of the wall time that storing took"}
+OF_FORCED = {"acceleration_rms": "rms of an acceleration component", "spectrum_error": "error of the mean spectrum",
+             "true_energy": "energy of the true tracers over the same time", "average_from": "averages from (T)"}
 REASONS = {
     **dict.fromkeys(("qr_kl", "qr_kl_floor"),
                     "it needs velocity gradients from the smoothing kernel, and there is no kernel.h5"),

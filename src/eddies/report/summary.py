@@ -118,14 +118,13 @@ def _with_spread(row: Row, column: str) -> Any:
 @styled
 def scatter(table: ErrorAgainstTime, measures: Sequence[str]) -> Figure:
     """Draw error against wall seconds per turnover, with one panel for each measure."""
-    columns, shown = min(len(measures), 2), {row["name"]: row for row in table.rows}
-    drawn = dict.fromkeys(row["name"] for measure in measures for row in table.finished(measure))
-    methods = [name for name in drawn if not shown[name]["on_grid"]]
-    styles = [_entry(table.looks[name], shown[name]["label"]) for name in methods]
-    if grids := [name for name in drawn if shown[name]["on_grid"]]:
+    columns = min(len(measures), 2)
+    drawn = [row for row in table.rows if any(row in table.finished(measure) for measure in measures)]
+    styles = [_entry(table.looks[row["name"]], row["label"]) for row in drawn if not row["on_grid"]]
+    if grids := [row["name"] for row in drawn if row["on_grid"]]:
         styles.append(_entry(table.looks[grids[-1]], "coarse grids, the finer the darker"))
     if table.stopped():
-        styles.append(Line2D([], [], color=DNS, marker="x", linestyle="", label="unstable"))
+        styles.append(_entry((DNS, "x"), "unstable"))
     styles.append(Line2D([], [], color=GUIDE, linestyle="--", label="Pareto front"))
     figure, axes = panels(-(-len(measures) // columns), columns, (5.4, 4.2) if columns == 2 else (9.3, 6.0))
     for axis in axes.flat[len(measures):]:
@@ -142,11 +141,8 @@ def _entry(look: Look, label: str) -> Line2D:
 
 
 def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
-    rows, stopped = table.finished(measure), table.stopped()
-    axis.set_xscale("log")
-    axis.set_yscale("log")
-    costs = [row[key] for row in [*rows, *stopped] for key in (COST, "wall_seconds_low", "wall_seconds_high")]
-    _set_limits(axis, costs, [row[measure] for row in rows])
+    rows = table.finished(measure)
+    axis.set(xscale="log", yscale="log", xlabel="wall seconds per turnover T", ylabel=in_symbols(MEASURES[measure]))
     for row in rows:
         colour, marker = table.looks[row["name"]]
         chosen = row["name"] == table.subject
@@ -155,13 +151,15 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
         down = min(spread, 0.9 * row[measure])  # a bar on a logarithmic axis does not reach 0
         axis.errorbar(row[COST], row[measure], [[down], [spread]], np.maximum(bars, 0), color=colour, marker=marker,
                       elinewidth=1, markersize=9 if chosen else 6, markeredgecolor=DNS if chosen else colour, zorder=4)
-    for row in stopped:
-        axis.plot(row[COST], _top(axis), color=table.looks[row["name"]][0], marker="x", markersize=7,
-                  markeredgewidth=1.8, zorder=4)
+    for row in table.stopped():  # a little below the upper edge
+        axis.plot(row[COST], 0.97, transform=axis.get_xaxis_transform(), color=table.looks[row["name"]][0], marker="x",
+                  markersize=7, markeredgewidth=1.8, zorder=4)
     front = pareto_front([row[COST] for row in rows], [row[measure] for row in rows])
     axis.plot([rows[index][COST] for index in front], [rows[index][measure] for index in front], color=GUIDE,
               linestyle="--", linewidth=1.2, zorder=1)
-    axis.set(xlabel="wall seconds per turnover T", ylabel=in_symbols(MEASURES[measure]))
+    axis.margins(0.16, 0.2)  # room for names
+    for part, (low, high) in ((axis.xaxis, axis.get_xlim()), (axis.yaxis, axis.get_ylim())):
+        plain_log_ticks(part, subs=(1, 2, 5) if high < 2000 * low else (1,))
     for row in _named(axis, table, rows, measure, front):
         axis.annotate(row["label"], (row[COST], row[measure]), (6, 6), textcoords="offset points", fontsize=8.5,
                       annotation_clip=False, zorder=5, fontweight="bold" if row["name"] == table.subject else "normal")
@@ -186,22 +184,3 @@ def _named(axis: Axes, table: ErrorAgainstTime, rows: Sequence[Row], measure: st
 def in_symbols(words: str) -> str:
     """Return a text in which the symbols t_η and k_d are written as formulas."""
     return words.replace("t_η", r"$t_\eta$").replace("k_d", "$k_d$")
-
-
-def _set_limits(axis: Axes, costs: Sequence[float], errors: Sequence[float]) -> None:
-    """Set the limits of both axes, and label their ticks with plain numbers.
-
-    The limits leave room for names and, at the top, for unstable variants.
-    """
-    for values, limit, room, part in ((costs, axis.set_xlim, (0.16, 0.16), axis.xaxis),
-                                      (errors, axis.set_ylim, (0.12, 0.2), axis.yaxis)):
-        lowest, highest = (min(values), max(values)) if values else (0.1, 1.0)
-        span = max(np.log10(highest / lowest), 0.3)
-        limit(lowest * 10 ** (-room[0] * span), highest * 10 ** (room[1] * span))
-        plain_log_ticks(part, subs=(1, 2, 5) if span < 2.5 else (1,))
-
-
-def _top(axis: Axes) -> float:
-    """Return the y value at which unstable variants are drawn: a little below the upper edge of the panel."""
-    low, high = np.log10(axis.get_ylim())
-    return 10 ** (high - 0.03 * (high - low))

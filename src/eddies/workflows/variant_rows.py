@@ -192,22 +192,20 @@ def notes(seeds: Sequence[int], without_kernel: Sequence[str], variants: Mapping
 
 
 def numbers(measured: Mapping[str, Any]) -> dict[str, Any]:
-    """Return status, accuracy and cost of a rollout from the numbers of its measures."""
-    attributes, ranks = measured["attributes"], measured["ranks"]
-    found = {"status": attributes["status"], "ranks": ranks, **measured["accuracy"],
-             "stopped_at": None if attributes["status"] == "complete" else attributes["turnovers"],
-             "time_step": attributes.get("time_step")}  # missing if the first step failed
-    if "seconds_per_step" in attributes:
-        found |= step_costs(attributes, attributes["eddy_turnover_time"], ranks)
+    """Return status, accuracy and cost of a rollout from the numbers of its measures.
+
+    Costs are the seconds per step, and per turnover the wall seconds (with quartiles) and the core seconds.
+    """
+    rollout, ranks = measured["attributes"], measured["ranks"]
+    found = {"status": rollout["status"], "ranks": ranks, **measured["accuracy"],
+             "stopped_at": None if rollout["status"] == "complete" else rollout["turnovers"],
+             "time_step": rollout.get("time_step")}  # missing if the first step failed
+    if "seconds_per_step" in rollout:
+        steps = rollout["eddy_turnover_time"] / rollout["time_step"]
+        seconds, low, high = (rollout[f"seconds_per_step{end}"] for end in ("", "_low", "_high"))
+        found |= {"seconds_per_step": seconds, "wall_seconds": seconds * steps, "wall_seconds_low": low * steps,
+                  "wall_seconds_high": high * steps, "core_seconds": seconds * steps * ranks * threads()}
     return found
-
-
-def step_costs(rollout: Mapping[str, Any], turnover: float, ranks: int) -> dict[str, float]:
-    """Return the seconds per step, and per turnover the wall seconds (with quartiles) and the core seconds."""
-    seconds, low, high = (rollout[f"seconds_per_step{end}"] for end in ("", "_low", "_high"))
-    steps = turnover / rollout["time_step"]
-    return {"seconds_per_step": seconds, "wall_seconds": seconds * steps, "wall_seconds_low": low * steps,
-            "wall_seconds_high": high * steps, "core_seconds": seconds * steps * ranks * threads()}
 
 
 def machine(device: str, ranks: int) -> dict[str, Any]:
