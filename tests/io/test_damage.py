@@ -79,7 +79,7 @@ def test_a_file_that_is_cut_off_or_overwritten_is_damaged(comm, path):
 
 
 def everything(path):
-    """All values and attributes of a file, as bytes, but for texts of H5MD."""
+    """All values and attributes of a file, as bytes. Texts of H5MD, which have no checksum, are left out."""
     found = {}
     with h5py.File(path, locking=False) as file:
         names = []
@@ -93,7 +93,7 @@ def everything(path):
 
 @pytest.mark.mpi(1)
 def test_no_changed_bit_gives_a_wrong_value(comm, tmp_path):
-    """Of a small file with all that a product holds. Some bits are of no use, such as those of free space."""
+    """The file is small and has all parts of a product. Some bits are not used, such as those of free space."""
     path = tmp_path / "rollout.h5"
     with create_product(comm, path, "rollout", {"scene": "text " * 200}) as file:
         write_table(file, "table", {"a": np.arange(40.0), "number": 2.5})

@@ -92,7 +92,7 @@ def test_variants_of_one_run_are_compared(comm, tmp_path, capfd):
 
 @pytest.mark.mpi(2)
 def test_damaged_products_are_found(comm, tmp_path, capfd):
-    """Also of variants. A link is not another product."""
+    """Also of variants. A link is not another product, and a product of an older version has no checksums."""
     if comm.rank == 0:
         alone = comm.Create_group(comm.group.Incl([0]))
         write_scene(tmp_path)
@@ -100,6 +100,8 @@ def test_damaged_products_are_found(comm, tmp_path, capfd):
         write_ground_truth(alone, tmp_path, frames=3)
         (tmp_path / "a/ground_truth.h5").symlink_to("../ground_truth.h5")
         write_kernel(alone, tmp_path)
+        with h5py.File(tmp_path / "kernel.h5", "r+") as file:
+            file["of an older version"] = np.ones(3)
         write_rollout(alone, tmp_path / "a")
     comm.Barrier()
 
@@ -108,7 +110,8 @@ def test_damaged_products_are_found(comm, tmp_path, capfd):
         output, errors = capfd.readouterr()
         return [line for line in output.splitlines() if line.startswith(f"{tmp_path}/")], errors
 
-    rest = [f"{tmp_path / name}.h5: not damaged" for name in ("ground_truth", "kernel")]
+    rest = [f"{tmp_path / 'ground_truth.h5'}: not damaged",
+            f"{tmp_path / 'kernel.h5'}: has no checksums, because an earlier version made it"]
     lines, _ = verified(0)
     assert lines == ([f"{tmp_path / 'a/rollout.h5'}: not damaged", *rest] if comm.rank == 0 else [])
     comm.Barrier()

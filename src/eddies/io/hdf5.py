@@ -17,7 +17,8 @@ from mpi4py import MPI
 
 from eddies.io.damage import checked_attributes, naming_damage, open_to_read
 from eddies.io.errors import ProductError, file_errors, read_errors, remedy_for
-from eddies.io.new_files import HEADER_BYTES, frame_bytes, new_file, python_value, set_attributes, writes_first, writing
+from eddies.io.new_files import (HEADER_BYTES, chunk_bytes, frame_bytes, new_file, python_value, set_attributes,
+                                 writes_first, writing)
 from eddies.io.provenance import FORMAT, environment, has_this_format, product_ids, read_json, read_provenance
 from eddies.io.units import conventions
 from eddies.parallel.broadcast import on_all_ranks, on_first_rank
@@ -176,10 +177,10 @@ def empty_dataset(group: h5py.Group, name: str, shape: tuple[int, ...], dtype: A
                   units: str = "") -> h5py.Dataset:
     """Create a dataset whose values are written later; collective. Its chunks have checksums. A single number is
     stored in the header of the dataset, which has a checksum. `axes` and `units` become its attributes."""
-    size = math.prod(shape) * np.dtype(dtype).itemsize
-    with writing(group, size + HEADER_BYTES * (1 + size // CHUNK_BYTES // 32)):
-        if shape and size:
-            dataset = group.create_dataset(name, shape, dtype, chunks=chunk_of(shape, dtype), fletcher32=True)
+    chunk = chunk_of(shape, dtype)
+    with writing(group, HEADER_BYTES + chunk_bytes(shape, chunk, np.dtype(dtype).itemsize)):
+        if shape and math.prod(shape):
+            dataset = group.create_dataset(name, shape, dtype, chunks=chunk, fletcher32=True)
         else:
             compact = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
             compact.set_layout(h5py.h5d.COMPACT)

@@ -177,8 +177,13 @@ def frame_bytes(dataset: h5py.Dataset) -> int:
     """Return an upper limit of the bytes by which a file grows when a chunked dataset gets one more frame."""
     if dataset.shape[0] % dataset.chunks[0]:
         return 0
-    chunks = math.prod(-(-extent // chunk) for extent, chunk in zip(dataset.shape[1:], dataset.chunks[1:]))
-    return chunks * (math.prod(dataset.chunks) * dataset.dtype.itemsize + INDEX_BYTES)
+    return chunk_bytes(dataset.shape[1:], dataset.chunks[1:], dataset.chunks[0] * dataset.dtype.itemsize)
+
+
+def chunk_bytes(shape: tuple[int, ...], chunk: tuple[int, ...], itemsize: int) -> int:
+    """Return an upper limit of the bytes of an array in chunks. HDF5 stores each chunk in full."""
+    chunks = math.prod(-(-extent // part) for extent, part in zip(shape, chunk))
+    return chunks * (math.prod(chunk) * itemsize + INDEX_BYTES)
 
 
 class _NewFile:

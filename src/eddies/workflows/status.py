@@ -8,11 +8,12 @@ from pathlib import Path
 from eddies.clock import duration
 from eddies.errors import UserError
 from eddies.io.checkpoint import checkpoints_in
-from eddies.io.damage import find_damage
+from eddies.io.damage import find_damage, has_checksums
 from eddies.io.errors import ProductError, remedy_for
 from eddies.io.hdf5 import in_files
 from eddies.io.provenance import product_fingerprint, product_provenance
 from eddies.io.run_lock import job_in
+from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import FILE_OF, STAGES, Stage
 from eddies.scene.scene import Scene, SceneError, load_scene
@@ -38,7 +39,7 @@ def run(directory: Path, comm: Comm, verify: bool = False) -> None:
     for path in products:
         complaint = _complaint(comm, path)
         damaged += complaint is not None
-        _print(comm, complaint or f"{path}: not damaged")
+        _print(comm, complaint or f"{path}: {on_first_rank(comm, lambda: _state(path))}")
     if damaged:
         raise UserError(f"{directory}: {damaged} of {len(products)} products are damaged or cannot be read")
 
@@ -50,6 +51,10 @@ def _complaint(comm: Comm, path: Path) -> str | None:
     except ProductError as error:
         return str(error)
     return damage and f"{damage}; {remedy_for(path.stem)}"
+
+
+def _state(path: Path) -> str:
+    return "not damaged" if has_checksums(path) else "has no checksums, because an earlier version made it"
 
 
 def products_in(directory: Path) -> list[Path]:

@@ -203,6 +203,14 @@ def test_weights_of_the_former_kernel_that_could_be_negative_are_refused(comm, t
         load_form(comm, tmp_path / "kernel.h5", SCALES)
 
 
+@pytest.mark.mpi(1)
+def test_a_kernel_with_a_form_of_an_earlier_version_is_refused(comm, tmp_path):
+    """The remedy keeps its weights."""
+    write_kernel(comm, tmp_path, form=NETWORK.formula, reconstruction="linear")
+    with pytest.raises(ProductError, match='kernel.h5: .* form "linear", .*"kriging".*`eddies train-kernel SCENE`'):
+        load_form(comm, tmp_path / "kernel.h5", SCALES)
+
+
 @pytest.mark.mpi(1, 2)
 def test_another_form_of_reconstruction_keeps_weights_and_id(comm, tmp_path):
     """A change of [kernel] form trains nothing, and products made with the kernel stay valid."""

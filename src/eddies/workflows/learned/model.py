@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from dataclasses import replace
 from itertools import zip_longest
@@ -18,7 +19,7 @@ from eddies.parallel.broadcast import first_complaint, on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import any_rank
 from eddies.particles.flow_units import ReferenceScales
-from eddies.particles.forms import Form
+from eddies.particles.forms import WORDS, Form
 from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.smoothing_kernels import KernelNetwork
@@ -119,8 +120,8 @@ def particles_for(model: LagrangianModel, columns: dict[str, np.ndarray], device
 def load_form(comm: Comm, path: str | Path, scales: ReferenceScales, device: torch.device | str = "cpu") -> Form:
     """Load the method of reconstruction (`Form`) that a kernel file names, with its kernel, for a flow of these scales.
 
-    The kernel is a table in single precision. Raises ProductError if the file cannot be read, or if its kernel was
-    trained with another formula.
+    The kernel is a table in single precision. Raises ProductError if the file cannot be read, or if its kernel has
+    another formula or form than those of this version.
     """
     stored = load_weights(comm, path, "kernel")
     description = stored.description
@@ -131,8 +132,13 @@ def load_form(comm: Comm, path: str | Path, scales: ReferenceScales, device: tor
         raise ProductError(f'{path}: was trained with the formula "{formula}", but this version uses '
                            f'"{network.formula}" for these settings: remove the file and run '
                            "`eddies train-kernel` again")
+    name = description.get("reconstruction", "average")
+    if name not in WORDS:
+        raise ProductError(f'{path}: names the form "{name}", which this version does not have; set form = '
+                           f'{" or ".join(map(json.dumps, WORDS))} in [kernel] of the scene and run '
+                           "`eddies train-kernel SCENE`, which keeps the weights")
     network = network.to(dtype=torch.float32, device=device)
     network.load_state_dict({name: torch.from_numpy(tensor) for name, tensor in stored.weights.items()})
     with torch.no_grad():
         kernel = network.table()
-    return Form(description.get("reconstruction", "average"), kernel, scales.filter_width)
+    return Form(name, kernel, scales.filter_width)
