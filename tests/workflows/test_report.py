@@ -11,11 +11,11 @@ import pytest
 from mpi4py import MPI
 
 from eddies import cli
-from eddies.io.hdf5 import ProductError
+from eddies.io.hdf5 import ProductError, WriteError
 from eddies.measures import MEASURES
 from eddies.parallel.stop import Stopped
 from eddies.scene.scene import SceneError, load_scene
-from eddies.workflows import dns, report
+from eddies.workflows import dns, measure, report
 from eddies.workflows.diff import numbers_of
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 from eddies.workflows.status import status_lines
@@ -242,6 +242,25 @@ def test_a_rollout_without_its_ground_truth(comm, tmp_path):
     metrics, page = written(tmp_path)
     assert metrics["rollouts"]["seconds_per_step"] is None and metrics["rollouts"]["particles"] == 600
     assert "not available: too few steps to time" in page
+
+
+@pytest.mark.usefixtures("no_figures")
+@pytest.mark.mpi(1, 2)
+def test_a_report_elsewhere_needs_no_place_for_measures(comm, tmp_path, monkeypatch):
+    """As of a run of an earlier version in a directory that cannot be written."""
+    def refused(*_):
+        raise WriteError("measures.h5: no place")
+
+    if comm.rank == 0:
+        write_rollout(MPI.COMM_SELF, tmp_path)
+    comm.Barrier()
+    monkeypatch.setattr(measure, "create_product", refused)
+    with pytest.raises(WriteError, match="no place"):
+        report.run(tmp_path, comm)
+    report.run(tmp_path, comm, output=tmp_path / "elsewhere")
+    comm.Barrier()
+    found = json.loads((tmp_path / "elsewhere/metrics.json").read_text())["rollouts"]
+    assert found[tmp_path.name]["turnovers"] == pytest.approx(0.8 / 1.2) and not (tmp_path / "measures.h5").exists()
 
 
 @pytest.mark.usefixtures("no_figures")

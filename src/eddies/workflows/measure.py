@@ -12,7 +12,8 @@ import numpy as np
 from eddies.analysis.rollout import spread
 from eddies.analysis.rollout_measures import PLANES, Tables, measures, of_model
 from eddies.analysis.velocity_gradients import Invariants
-from eddies.io.hdf5 import ProductError, Table, create_product, in_files, open_product, read_table, write_table
+from eddies.io.errors import ProductError, WriteError
+from eddies.io.hdf5 import Table, create_product, in_files, open_product, read_table, write_table
 from eddies.io.new_files import set_attributes
 from eddies.io.provenance import product_ids, product_provenance, read_json
 from eddies.measures import MEASURES
@@ -33,20 +34,22 @@ AXES = {"velocity_pdfs": "time bin", "acceleration_pdfs": "time bin", "planes": 
         "forced_accelerations": "bin"}
 UNITS = {"time": "T", "lag": "T", "wavenumber": "1/L", "energy": "L^2/T^2", "density_rms": "M/L^3", "u_x": "L/T",
          "vorticity": "1/T", "structure": "L^2/T^2", "acceleration_variance": "L^2/T^4"}
+Measures = tuple[dict[str, Any], Tables]  # numbers and tables
 Task = tuple[str, str, int]  # quantity ("spectra", "invariants" or "planes"), "model" or "truth", frame
 
 
-def run(directory: Path, comm: Comm) -> None:
+def run(directory: Path, comm: Comm, kept: dict[Path, Measures] | None = None) -> None:
     """Measure the rollout of a run directory and write measures.h5; all ranks call it.
 
-    Raises ProductError on all ranks if a product cannot be read, and WriteError if measures.h5 cannot be written.
+    Raises ProductError on all ranks if a product cannot be read, and WriteError if measures.h5 cannot be written. If
+    `kept` is given, rank 0 then puts the measures there instead.
     """
     alone = comm.Split(comm.rank)
     try:
         with on_all_ranks(comm, lambda: open_rollout(directory, alone), ProductError) as opened:
             if opened.solver is not None:
                 _measure_frames(opened, comm)
-            in_files(comm, directory, lambda: _write(directory, opened, alone, comm.size))
+            in_files(comm, directory, lambda: _write(directory, opened, alone, comm.size, kept))
     finally:
         alone.Free()
 
@@ -59,10 +62,10 @@ def rollouts_in(directory: Path, comm: Comm) -> list[Path]:
     return found
 
 
-def update(directory: Path, comm: Comm) -> None:
-    """Measure the rollout of a run directory unless measures.h5 fits the products there; all ranks call it."""
+def update(directory: Path, comm: Comm, kept: dict[Path, Measures] | None = None) -> None:
+    """Measure the rollout of a run directory, as `run`, unless measures.h5 fits the products there."""
     if on_first_rank(comm, lambda: not is_current(directory)):
-        run(directory, comm)
+        run(directory, comm, kept)
 
 
 def is_current(directory: Path) -> bool:
@@ -71,7 +74,7 @@ def is_current(directory: Path) -> bool:
     return made_from is not None and made_from == product_ids(directory, MADE_FROM)
 
 
-def read(directory: Path, alone: Comm) -> tuple[dict[str, Any], Tables]:
+def read(directory: Path, alone: Comm) -> Measures:
     """Return the numbers and the tables in measures.h5, as `measures` makes them, on one rank.
 
     The numbers also have the keys `attributes`, the attributes of the rollout; `ranks`, those of the rollout;
@@ -123,7 +126,7 @@ def _tasks(opened: StoredRollout) -> list[Task]:
     return list(dict.fromkeys(tasks))
 
 
-def _write(directory: Path, opened: StoredRollout, alone: Comm, ranks: int) -> None:
+def _write(directory: Path, opened: StoredRollout, alone: Comm, ranks: int, kept: dict[Path, Measures] | None) -> None:
     rollout = opened.rollout
     try:
         numbers, tables = measures(rollout, opened.stationary)
@@ -134,8 +137,14 @@ def _write(directory: Path, opened: StoredRollout, alone: Comm, ranks: int) -> N
                 "reconstructed_by": rollout.reconstructed_by, "filter_width": rollout.reference.get("filter_width"),
                 "truth": product_ids(directory, ("ground_truth",)).get("ground_truth")}
     origin = {"scene": opened.provenance.get("scene", ""), "made_from": MADE_FROM, "ranks": ranks}
-    with create_product(alone, directory / FILE, "measures", origin) as file:
-        set_attributes(file, {"numbers": json.dumps(numbers, default=np.ndarray.tolist)})
-        for name, columns in tables.items():
-            units = {column: UNITS.get(column, UNITS.get(column.rpartition("_")[0], "")) for column in columns}
-            write_table(file, name, Table(columns, AXES.get(name, "time"), units))
+    text = json.dumps(numbers, default=np.ndarray.tolist)
+    try:
+        with create_product(alone, directory / FILE, "measures", origin) as file:
+            set_attributes(file, {"numbers": text})
+            for name, columns in tables.items():
+                units = {column: UNITS.get(column, UNITS.get(column.rpartition("_")[0], "")) for column in columns}
+                write_table(file, name, Table(columns, AXES.get(name, "time"), units))
+    except WriteError:
+        if kept is None:
+            raise
+        kept[directory] = json.loads(text), tables

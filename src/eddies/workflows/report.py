@@ -73,6 +73,7 @@ class Report:
     provenance : that of the products in the directory `base`, by kind.
     numbers : the content of metrics.json without warnings.
     scanned : a sentence on each product with numbers that are not finite, else "", by file.
+    kept : measures that could not be written beside their rollout, by its directory.
     """
 
     directory: Path
@@ -84,6 +85,7 @@ class Report:
     provenance: dict[str, dict[str, Any]] = field(default_factory=dict)
     numbers: dict[str, Any] = field(default_factory=dict)
     scanned: dict[Path, str] = field(default_factory=dict)
+    kept: dict[Path, Any] = field(default_factory=dict)
 
     @classmethod
     def of(cls, directory: Path, chosen: Sequence[str] = ()) -> Report:
@@ -177,7 +179,7 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: S
         raise SceneError(problem)
     report = in_files(comm, directory, lambda: Report.of(directory, variants))
     for where in report.rollouts:
-        _measure().update(where, comm)
+        _measure().update(where, comm, None if output is None else report.kept)
         stop.check()
     stop.check()
     alone, output = comm.Split(comm.rank), output or directory / "report"
@@ -191,7 +193,7 @@ def sections_of(directory: Path, alone: Comm) -> list[Section]:
     """Return the sections of the report of a run directory on one rank, with figures that are not yet made."""
     report = Report.of(directory)
     for where in report.rollouts:
-        _measure().update(where, alone)
+        _measure().update(where, alone, report.kept)
     _make(report, 1, alone)
     return report.sections
 
@@ -204,7 +206,7 @@ def _measure() -> Any:
 def _make(report: Report, ranks: int, alone: Comm) -> None:
     """Read the products and the measures of a run, and add the content of its report. `ranks` is the number of ranks of
     the job."""
-    measures = {where: _measure().read(where, alone) for where in report.rollouts}
+    measures = {where: report.kept.get(where) or _measure().read(where, alone) for where in report.rollouts}
     found = {name: report.variant(name, *measures[runs[0]]) for name, runs in report.variants.items()
              if runs[0] in measures}
     shared = _shared(report, alone)
