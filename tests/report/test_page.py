@@ -4,7 +4,7 @@ import json
 
 from eddies.report.page import Section, render_page, strict
 
-RUN = {"name": "run", "title": "the title of its scene", "scene": "a <b> & c", "products": [("stage",), ("dns",)]}
+RUN = {"name": "run", "title": "the title of its scene", "scene": "a <b> & c", "warnings": []}
 
 
 def test_a_value_that_is_not_finite_is_missing_on_the_page_and_null_in_the_file():

@@ -103,8 +103,7 @@ def write_page(output: Path, sections: Sequence[Section], beside: Mapping[str, s
 def render_page(sections: Sequence[Section], **run: Any) -> str:
     """Return the page as HTML. Figures that are not drawn yet are left out.
 
-    run: `name`, `title` and `scene`, the text of the scene; `products`, rows of a table, the header first; `warnings`,
-    sentences on products that do not fit together.
+    run: `name`, `title` and `scene`, the text of the scene; `warnings`, sentences on products that do not fit together.
     """
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["embedded"] = _embedded

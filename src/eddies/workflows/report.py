@@ -34,7 +34,7 @@ from eddies.pipeline import FILE_OF, MAKER_OF
 from eddies.report import (figures, ground_truth, kernel, models, reconstruction, rollouts, stationary, steps, summary,
                            tracers)
 from eddies.report.figures import Variant
-from eddies.report.page import Section, shown, strict, write_page
+from eddies.report.page import Section, strict, write_page
 from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.scene.terms import PRESETS
 from eddies.workflows.ground_truth.stationary import read_stationary_span
@@ -228,6 +228,12 @@ def _make(report: Report, ranks: int, alone: Comm) -> None:
     _add_learned(report, alone)
     report.sections += shared
     report.numbers |= {section.key: section.numbers for section in shared}
+    seconds = report.numbers["cost"]["stage_seconds"] or {}
+    stages = {MAKER_OF[kind].name: {"wall seconds": seconds.get(MAKER_OF[kind].name), **origin}
+              for kind, origin in report.provenance.items()}
+    report.sections.append(Section("run", "The run", columns={
+        key: {stage: origin[key] for stage, origin in stages.items()}
+        for key in ("wall seconds", "ranks", "date", "eddies", "commit", "libraries")}))
     report.numbers["warnings"] = [*doubts(report.base, report.provenance, report.old), *_other_doubts(report),
                                   *(words for words in report.scanned.values() if words)]
 
@@ -378,14 +384,7 @@ def _draw(sections: Sequence[Section]) -> None:
 def _write(report: Report, output: Path) -> None:
     """Draw the figures, write the page and the numbers, and log the main numbers; one rank calls it."""
     _draw(report.sections)
-    products = [("stage", "ranks", "wall time (s)", "date", "eddies", "commit", "libraries")]
-    seconds, warnings = report.numbers["cost"]["stage_seconds"] or {}, report.numbers["warnings"]
-    for kind, origin in report.provenance.items():
-        stage = MAKER_OF[kind].name
-        products.append((stage, str(origin["ranks"]), shown(seconds[stage]) if stage in seconds else "not stored",
-                         origin["date"], origin["eddies"],
-                         origin["commit"][:12] if origin["commit"] else "not a checkout",
-                         ", ".join(f"{name} {version}" for name, version in origin["libraries"].items())))
+    warnings = report.numbers["warnings"]
     text = report.scene.to_toml() if report.scene is not None and report.scene.variant else (
         list(report.provenance.values())[-1]["scene"])
     texts = {"metrics.json": json.dumps(strict(report.numbers), indent=2, allow_nan=False) + "\n"}
@@ -395,8 +394,8 @@ def _write(report: Report, output: Path) -> None:
         writer.writeheader()
         writer.writerows(report.numbers["rows"])
         texts["variants.csv"] = lines.getvalue()
-    write_page(output, report.sections, texts, name=report.directory.resolve().name, scene=text, products=products,
-               title=tomllib.loads(text).get("title", "untitled scene"), warnings=warnings)
+    write_page(output, report.sections, texts, name=report.directory.resolve().name, scene=text, warnings=warnings,
+               title=tomllib.loads(text).get("title", "untitled scene"))
     for section in report.sections:
         count = len(section.illustrations)
         log.info("report: %s%s", section.title, f" ({count} figure{'s' if count > 1 else ''})" if count else "")
