@@ -66,7 +66,8 @@ def test_a_model_that_is_the_stationary_flow_but_for_a_factor():
     assert rms["model"] == pytest.approx(1.1 * rms["flow at the start"], rel=1e-12)
     for name in ("velocity_kl", "acceleration_kl", "qr_kl"):
         assert value[name] == pytest.approx(0, abs=1e-9)
-    assert tables["forced_spectra"]["model"] == pytest.approx(blocks.mean() * tables["forced_spectra"]["flow"])
+    spectra = tables["forced_spectra"]
+    assert spectra["energy_model"] == pytest.approx(blocks.mean() * spectra["energy_flow"])
     assert tables["forced_accelerations"]["model"] == pytest.approx(tables["forced_accelerations"]["truth"])
 
 

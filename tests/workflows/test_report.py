@@ -11,7 +11,7 @@ import pytest
 from mpi4py import MPI
 
 from eddies import cli
-from eddies.io.hdf5 import ProductError, WriteError
+from eddies.io.errors import ProductError, WriteError
 from eddies.measures import MEASURES
 from eddies.parallel.stop import Stopped
 from eddies.scene.scene import SceneError, load_scene

@@ -157,9 +157,12 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
     front = pareto_front([row[COST] for row in rows], [row[measure] for row in rows])
     axis.plot([rows[index][COST] for index in front], [rows[index][measure] for index in front], color=GUIDE,
               linestyle="--", linewidth=1.2, zorder=1)
-    axis.margins(0.16, 0.2)  # room for names
-    for part, (low, high) in ((axis.xaxis, axis.get_xlim()), (axis.yaxis, axis.get_ylim())):
-        plain_log_ticks(part, subs=(1, 2, 5) if high < 2000 * low else (1,))
+    for part, (low, high), limit in ((axis.xaxis, axis.dataLim.intervalx, axis.set_xlim),
+                                     (axis.yaxis, axis.dataLim.intervaly, axis.set_ylim)):
+        if high >= low:
+            room = max(high / low, 2) ** 0.18  # for names
+            limit(low / room, high * room)
+        plain_log_ticks(part, subs=(1, 2, 5) if high < 300 * low else (1,))
     for row in _named(axis, table, rows, measure, front):
         axis.annotate(row["label"], (row[COST], row[measure]), (6, 6), textcoords="offset points", fontsize=8.5,
                       annotation_clip=False, zorder=5, fontweight="bold" if row["name"] == table.subject else "normal")
