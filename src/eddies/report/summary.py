@@ -142,7 +142,8 @@ def _entry(look: Look, label: str) -> Line2D:
 
 def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
     rows = table.finished(measure)
-    axis.set(xscale="log", yscale="log", xlabel="wall seconds per turnover T", ylabel=in_symbols(MEASURES[measure]))
+    axis.set(xscale="log", yscale="log", xlabel="wall seconds per turnover T", ylabel=in_symbols(MEASURES[measure]),
+             autoscale_on=False)
     for row in rows:
         colour, marker = table.looks[row["name"]]
         chosen = row["name"] == table.subject
