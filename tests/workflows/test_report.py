@@ -146,15 +146,6 @@ def test_forced_rollouts_are_compared_with_the_stationary_state_if_there_is_one(
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_a_rollout_that_breaks_at_once_is_not_compared(comm, tmp_path):
-    write_run(comm, tmp_path, status="stopped: particle 3 is too fast", broken=0)
-    report.run(tmp_path, comm)
-    metrics, page = written(tmp_path)
-    assert metrics["rollouts"]["velocity_error"] is None and metrics["rollouts"]["stable"] is False
-    assert "stopped: particle 3 is too fast" in page and "no time at which model and truth both have" in page
-
-
-@pytest.mark.usefixtures("no_figures")
 def test_models_are_shown_with_their_source_and_the_flows_of_their_training(comm, tmp_path):
     def models(**own):
         write_model(comm, tmp_path, **own)
