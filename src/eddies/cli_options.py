@@ -160,4 +160,4 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
     how_much.add_argument("--quiet", action="store_const", const="outcome", dest="log",
                           help="log only warnings, and at the end the path of the product")
     how_much.add_argument("--verbose", action="store_const", const="debug", dest="log",
-                          help="log each step, and the time of frames, checkpoints and parts of the report")
+                          help="log each step, and the time of frames and checkpoints")
