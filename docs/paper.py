@@ -12,7 +12,6 @@ import io
 import json
 import shutil
 import sys
-from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -20,24 +19,21 @@ from mpi4py import MPI
 from PIL import Image
 
 from eddies import open_run
-from eddies.analysis.against_truth import EDGES, conditional_flows, last_invariants, pdf_divergence
-from eddies.analysis.pdfs import bin_centres, bin_edges, bin_probabilities, gaussian, kl_divergence, pdf, standardized
-from eddies.analysis.rollout import Rollout
+from eddies.analysis.pdfs import bin_edges, bin_probabilities, gaussian, kl_divergence, pdf, standardized
 from eddies.flow.statistics import energy_spectrum
 from eddies.parallel.slab import SlabDecomposition
-from eddies.report.figures import (DNS, FILTERED, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, guide_power_law,
-                                   legend_at_foot, letter, note, number_wavenumbers, panels, png, styled)
-from eddies.report.rollout_figures import invariant_plane, velocity_planes, vorticity_and_energy
+from eddies.report.figures import (DNS, FILTERED, GUIDE, LOOKS, OTHERS, TRUTH, Variant, guide_power_law,
+                                   legend_at_foot, letter, mark_cutoff, number_wavenumbers, panels, png, styled)
+from eddies.report.rollout_figures import (invariant_planes, particle_pdfs, turnover_of, velocity_planes,
+                                           vorticity_and_energy)
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.stored_run import StoredRun
-from eddies.workflows.rollout.measured import open_rollout
+from eddies.workflows import measure
 
 HERE = Path(__file__).parent / "paper"
-# Variants in the figures: label, line.
-MODELS = {"paper-forced": ("paper, forced", {"color": FOURTH, "linestyle": "-."}),
-          "paper": ("paper", {"color": MODEL}),
-          "resolved": ("resolved", {"color": SECOND, "linestyle": "--"}),
-          "local": ("local", {"color": THIRD, "linestyle": ":"})}
+# Variants in the figures: label, colour and marker.
+MODELS = {"paper-forced": ("paper, forced", OTHERS[0]), "paper": ("paper", LOOKS["paper"]),
+          "resolved": ("resolved", LOOKS["resolved"]), "local": ("local", LOOKS["local"])}
 BEFORE = bin_edges(8, 65)  # bins of Fig. 3, in standard deviations
 NAMES = "training", "mt008", "mt016", "mt004"
 NUMBERS = Path(__file__).parent / "results/paper-a-priori.json"
@@ -66,11 +62,12 @@ def numbers_of(run: StoredRun) -> dict:
 @styled
 def figure_3(numbers: dict[str, dict]):
     """Draw errors at the true state over delay and Mach number, and PDFs of the acceleration."""
-    figure, axes = panels(2, 3, (3.6, 2.9), foot=0.3)
+    figure, axes = panels(2, 3, (3.6, 2.9))
     delay, machs, *shown = axes.flat
     training = numbers["training"]
     for name in training["models"]:
-        label, line = MODELS[name]
+        label, (colour, _) = MODELS[name]
+        line = {"color": colour}
         delay.plot(training["delay"], training["models"][name], label=label, **line)
         found = sorted((each["mach"], np.mean(each["models"][name])) for key, each in numbers.items()
                        if key != "training")
@@ -82,7 +79,7 @@ def figure_3(numbers: dict[str, dict]):
     machs.set(xlabel="$M_t$", ylim=(0, None), title="unseen flows, mean over time")
     centres = (BEFORE[1:] + BEFORE[:-1]) / 2
     for axis, (key, each) in zip(shown, numbers.items()):
-        lines = {"color": TRUTH}, {"color": MODEL, "linestyle": "none", "marker": "o", "markersize": 3,
+        lines = {"color": TRUTH}, {"color": LOOKS["paper"][0], "linestyle": "none", "marker": "o", "markersize": 3,
                                    "markerfacecolor": "none"}
         for density, line in zip(np.array(each["pdfs"]), lines):
             axis.semilogy(centres, np.where(density > 0, density, np.nan), **line)
@@ -92,86 +89,46 @@ def figure_3(numbers: dict[str, dict]):
                  ylabel="PDF")
     for axis in shown[len(numbers):]:
         axis.remove()
-    legend_at_foot(figure, delay, 4)
+    legend_at_foot(figure, delay)
     letter([*axes.flat][:2 + len(numbers)])
     return figure
 
 
-def figure_4(rollouts: dict[str, Rollout]):
-    """Draw u_x in the plane z = pi over time: true tracers above, models below, by label."""
-    first = next(iter(rollouts.values()))
-    shown = first.common.spread(4)
-    rows = {"true tracers": [first.both(first.planes, index)[1] for index in shown]}
-    rows |= {label: [run.both(run.planes, index)[0] for index in shown] for label, run in rollouts.items()}
-    return velocity_planes(rows, first.common.times[list(shown)] / first.turnover)
-
-
-def figure_5(rollouts: dict[str, Rollout]):
-    """Draw vorticity and kinetic energy in the plane z = pi at the end: true tracers, then models."""
-    first = next(iter(rollouts.values()))
-    last = len(first.common.times) - 1
-    return vorticity_and_energy({"true tracers": first.both(first.planes, last)[1],
-                                 **{MODELS[name][0]: run.both(run.planes, last)[0] for name, run in rollouts.items()}})
+def drawn(run: Path, names: list[str]) -> list[Variant]:
+    """The measures of variants of a run, which are made if they are missing."""
+    for name in names:
+        measure.update(run / name, MPI.COMM_SELF)
+    return [Variant(*MODELS[name], *measure.read(run / name, MPI.COMM_SELF)) for name in names]
 
 
 @styled
-def figure_6(rollouts: dict[str, Rollout]):
-    """Draw PDFs of velocity and acceleration of the particles at three times, in units of the truth's deviation."""
-    figure, axes = panels(2, 3, (3.5, 2.7), foot=0.3, sharex="row", sharey="row")
-    first = next(iter(rollouts.values()))
-    for row, (quantity, edges) in zip(axes, EDGES.items()):
-        centres = bin_centres(edges)
-        for axis, index in zip(row, first.common.spread(4)[1:]):
-            truth = first.pair(index, quantity).truth
-            lines = [("true tracers", {"color": TRUTH, "linewidth": 2.4}, truth)]
-            lines += [(*MODELS[name], run.pair(index, quantity).model) for name, run in rollouts.items()]
-            for label, line, values in lines:
-                density = pdf(standardized(values, truth), edges)
-                axis.semilogy(centres, np.where(density > 0, density, np.nan), label=label, **line)
-            axis.semilogy(centres, gaussian(centres), color=GUIDE, linestyle=":", linewidth=1, label="Gaussian")
-            divergence = pdf_divergence(rollouts["paper"].pair(index, quantity), edges)
-            time = first.common.times[index] / first.turnover
-            axis.set_title(f"$t = {time:.2f}\\,T$,  KL of paper {divergence:.2g}")
-            axis.set(xlabel=f"${quantity[0]}$ / standard deviation of the truth",
-                     ylim=(0.4 / truth.size / (edges[1] - edges[0]), 2))
-        row[0].set_ylabel(f"{quantity} PDF")
-    legend_at_foot(figure, axes[0, 0], 6)
-    letter(axes.flat)
-    return figure
-
-
-@styled
-def figure_8(rows: list[tuple[str, dict[str, Rollout], dict[str, StoredRun]]]):
+def figure_8(rows: list[tuple[str, list[Variant], list[StoredRun]]]):
     """Draw energy spectra at the start, the middle and the end; a row for each flow.
 
     Spectra of particles are those of the field that the learned kernel reconstructs, as in the paper.
     """
-    figure, axes = panels(len(rows), 3, (3.5, 3.1), foot=0.3, sharex=True, sharey=True)
+    figure, axes = panels(len(rows), 3, (3.5, 3.1), sharex=True, sharey=True)
     for row, (title, rollouts, stored) in zip(axes, rows):
-        first = next(iter(rollouts.values()))
-        flow, cutoff = first.flow, first.filter_wavenumber
+        flow, cutoff = rollouts[0].tables["flow_spectra"], rollouts[0].numbers["rollout"]["filter_wavenumber"]
         known = flow["wavenumber"] >= 1
-        for axis, index in zip(row, first.common.spread(3)):
-            time = first.common.times[index]
-            nearest = int(np.argmin(np.abs(flow["time"] - (first.start_time + time))))
-            for column, line in (("energy", {"color": DNS, "label": "DNS"}),
-                                 ("filtered", {"color": FILTERED, "label": "filtered DNS"})):
-                axis.loglog(flow["wavenumber"][known], flow[column][nearest][known], linewidth=1.2, **line)
-            draw_spectrum(axis, next(iter(stored.values())).field(time=time, of="truth"), cutoff, label="true tracers",
+        for number, (axis, time) in enumerate(zip(row, flow["time"])):
+            for column, line in (("energy_flow", {"color": DNS, "linestyle": ":", "label": "DNS"}),
+                                 ("energy_filtered", {"color": FILTERED, "label": "filtered DNS"})):
+                axis.loglog(flow["wavenumber"][known], flow[column][number][known], linewidth=1.2, **line)
+            draw_spectrum(axis, stored[0].field(time=time, of="truth"), cutoff, label="true tracers",
                           color=TRUTH)
-            for name, run in stored.items():
-                draw_spectrum(axis, run.field(time=time, of="model"), cutoff, label=MODELS[name][0], **MODELS[name][1])
-            axis.axvline(cutoff, color=GUIDE, linestyle=":", linewidth=1)
-            note(axis, r"$\pi/d$", (cutoff, 0.01), ("data", "axes fraction"), (3, 1))
-            axis.set_title(f"{title}, $t = {time / first.turnover:.2f}\\,T$")
+            for each, run in zip(rollouts, stored):
+                draw_spectrum(axis, run.field(time=time, of="model"), cutoff, **each.line(each.tables["spectra"]))
+            mark_cutoff(axis, cutoff)
+            axis.set_title(f"{title}, $t = {time / turnover_of(rollouts):.2f}\\,T$")
             number_wavenumbers(axis)
         row[0].set_ylabel("$E(k)$")
     for axis in axes[-1]:
         axis.set_xlabel("wavenumber $k$")
-    peak = max(flow["energy"].max(axis=0))
+    peak = max(flow["energy_flow"].max(axis=0))
     guide_power_law(axes[0, 0], (2, 10), 2.2 * peak, -5 / 3, r"$k^{-5/3}$")
     axes[0, 0].set(ylim=(1e-5 * peak, 6 * peak), xlim=(0.9, 85))
-    legend_at_foot(figure, axes[0, 0], 7)
+    legend_at_foot(figure, axes[0, 0])
     letter(axes.flat)
     return figure
 
@@ -202,28 +159,20 @@ def main(arguments: list[str]) -> None:
     for name, run in runs.items():
         if name == "training":
             continue
-        shutil.copy(run.path / "report/variants.json", NUMBERS.parent / f"paper-{name}.json")
+        shutil.copy(run.path / "report/metrics.json", NUMBERS.parent / f"paper-{name}.json")
     save(HERE / "figure-3.png", figure_3(numbers))
     if "training" in runs:
-        drawn = runs["training"].variant("paper").figures
-        save(HERE / "figure-1.png", drawn["figure-1-kernels"])
-        save(HERE / "figure-2.png", drawn["figure-2-reconstruction"])
+        shown = runs["training"].figures
+        save(HERE / "figure-1.png", shown["figure-1-kernels"])
+        save(HERE / "figure-2.png", shown["figure-2-reconstruction"])
     if not {"mt008", "mt016"} <= {*runs}:
         return
-    with ExitStack() as files:
-        opened = {name: {variant: files.enter_context(open_rollout(runs[name].variant(variant).path,
-                                                                   MPI.COMM_SELF)).rollout for variant in MODELS}
-                  for name in ("mt016", "mt008")}
-        rollouts = opened["mt016"]
-        save(HERE / "figure-4.png", figure_4({MODELS[name][0]: run for name, run in rollouts.items()}))
-        save(HERE / "figure-5.png", figure_5(rollouts))
-        save(HERE / "figure-6.png", figure_6(rollouts))
-        run = rollouts["paper-forced"]
-        statistics = last_invariants(run)
-        save(HERE / "figure-7.png", invariant_plane(statistics, conditional_flows(run, statistics.bins)))
-        save(HERE / "figure-8.png", figure_8([(f"$M_t = {mach_number(runs[name]):.2f}$", found,
-                                    {variant: runs[name].variant(variant) for variant in MODELS})
-                                   for name, found in opened.items()]))
+    rollouts = {name: drawn(runs[name].path, [*MODELS]) for name in ("mt016", "mt008")}
+    for number, draw in ((4, velocity_planes), (5, vorticity_and_energy), (6, particle_pdfs), (7, invariant_planes)):
+        save(HERE / f"figure-{number}.png", draw(rollouts["mt016"]))
+    save(HERE / "figure-8.png", figure_8([(f"$M_t = {mach_number(runs[name]):.2f}$", found,
+                                           [runs[name].variant(variant) for variant in MODELS])
+                                          for name, found in rollouts.items()]))
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 import eddies
+from eddies.workflows.diff import numbers_of
 
 CHECKOUT = Path(__file__).parents[1]
 EXAMPLES = CHECKOUT / "docs" / "examples"
@@ -25,8 +26,8 @@ SMALL = ["flow.cells=16", "spin_up.turnovers=0.1", "tracers.particles_per_side=8
 
 def results(directory):
     """Metrics of the report, and terms and weights of the model."""
-    metrics = json.loads((directory / "report" / "metrics.json").read_text())
-    assert metrics["rollout"]["status"] == "complete" and math.isfinite(metrics["model"]["acceleration_error"])
+    metrics = numbers_of(directory, None)
+    assert metrics["rollouts"]["status"] == "complete" and math.isfinite(metrics["models"]["acceleration_error"])
     with h5py.File(directory / "model.h5") as file:
         weights = {name: values[()] for name, values in file["weights"].items()}
         return metrics, json.loads(file.attrs["description"])["terms"], weights
@@ -70,7 +71,7 @@ def test_a_term_of_the_users(example):
     run = example("own_term")
     metrics, terms, weights = results(run)
     assert list(terms) == ["pressure", "own_term:SmagorinskyStress", "viscosity", "relaxation", "pairs"]
-    assert metrics["rollout"]["method"].endswith("pressure, SmagorinskyStress, viscosity, relaxation, pairs")
+    assert metrics["rollouts"]["method"].endswith("pressure, SmagorinskyStress, viscosity, relaxation, pairs")
     learned = weights["terms.SmagorinskyStress.squared_constant"]
     assert learned.shape == () and learned > 0 and learned != np.float32(0.17**2)
     assert "own_term:" in (run / "scene.toml").read_text()  # the scene of a run names the classes of the user

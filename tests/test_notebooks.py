@@ -57,8 +57,8 @@ def kernel(folder):
 
 @pytest.fixture
 def execute(folder, kernel):
-    """A function that runs a notebook, whose reports have no figures `but` those of these functions. It returns the
-    cells by id, and the value of an expression at the end."""
+    """A function that runs a notebook, whose reports have no figures `but` these. It returns the cells by id, and the
+    value of an expression at the end."""
     def run(name, expression, but=(), **parameters):
         notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
         (place,) = [number for number, cell in enumerate(notebook.cells)
@@ -91,7 +91,7 @@ def test_notebooks_are_kept_without_output():
 
 def test_a_first_run(execute, folder):
     cells, (error, without) = execute("a-first-run", "[error.values.tolist(), without.values.tolist()]",
-                                      but=["particle_pdfs"], changes=[*SMALLER, "training.steps=30",
+                                      but=["figure-6-pdfs"], changes=[*SMALLER, "training.steps=30",
                                                                       "simulation.turnovers=0.1", NO_SEARCH])
     shown = figures(cells)
     assert set(shown) == {"paths", "spectra", "field", "report"} and min(map(len, shown.values())) > 9000

@@ -96,7 +96,7 @@ def test_figures_are_those_of_the_report(comm, directory, monkeypatch):
     run = eddies.open_run(directory)
     assert {f"{name}.png" for name in run.figures} == {path.name for path in (directory / "report/figures").iterdir()}
     assert all(figure.axes for figure in run.figures.values())
-    assert run.metrics["rollout"]["energy_ratio"] > 0
+    assert run.metrics["rollouts"][directory.name]["energy_ratio"] > 0
 
 
 @pytest.mark.mpi(1)

@@ -25,7 +25,7 @@ from eddies.clock import duration
 from eddies.cores import check_threads, default_to_one_thread
 from eddies.errors import UserError
 from eddies.logs import OUTCOME, configure_logging, show_warnings
-from eddies.pipeline import STAGES
+from eddies.pipeline import FILE_OF, STAGES
 from eddies.scene.scene import SceneError, builtin_scenes, json_schema, load_scene
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ EXAMPLES = {
     "train": ("eddies train hit-small", "eddies train hit-mt016 --set model.path=runs/hit"),
     "find-step": ("eddies find-step hit-small --set simulation.integrator=verlet",),
     "simulate": ("eddies simulate hit-small --overwrite --set simulation.method=none",),
+    "measure": ("eddies measure runs/hit-small",),
     "report": ("eddies report runs/hit-small --open",),
     "export": ("eddies export runs/tiny --format vtkhdf", "eddies export runs/hit --format lagrangebench"),
     "check": ("eddies check hit", "eddies check mine.toml --set flow.cells=256 --unset forcing --json"),
@@ -221,6 +222,14 @@ def report_command(options: argparse.Namespace, comm: Comm) -> None:
         webbrowser.open(page.resolve().as_uri())
 
 
+def measure_command(options: argparse.Namespace, comm: Comm) -> None:
+    """Measure the rollout of a run directory, or the rollouts of its variants."""
+    from eddies.workflows import measure
+    for where in measure.rollouts_in(options.run, comm):
+        measure.run(where, comm)
+        log.log(OUTCOME, "measure: %s", where / FILE_OF["measures"])
+
+
 def export_command(options: argparse.Namespace, comm: Comm) -> None:
     """Write the fields and particles of a run directory in another format."""
     from eddies.stored_run import variant_directory
@@ -258,20 +267,17 @@ def status_command(options: argparse.Namespace, comm: Comm) -> None:
 
 
 def diff_command(options: argparse.Namespace, comm: Comm) -> None:
-    """Print the differences between two runs, or between runs of variants."""
-    from eddies.stored_run import variant_directory
-    runs = [run for run in (options.one, options.other) if run is not None]
-    names = options.variants
-    if names:
-        runs = [variant_directory(run, name) for run in runs for name in names]
+    """Print the differences between two runs, or between variants."""
+    runs = [(run, name) for run in (options.one, options.other) if run is not None
+            for name in options.variants or [None]]
     if len(runs) != 2:
         raise OptionError("diff: give two runs, or one run and --variant twice, or two runs and --variant once")
     import_module("eddies.workflows.diff").run(*runs, comm)
 
 
 # All others are stages, or `run`.
-COMMANDS = {"report": report_command, "export": export_command, "check": check_command, "scenes": scenes_command,
-            "status": status_command, "diff": diff_command}
+COMMANDS = {"measure": measure_command, "report": report_command, "export": export_command, "check": check_command,
+            "scenes": scenes_command, "status": status_command, "diff": diff_command}
 
 
 # ---- command line
@@ -301,10 +307,13 @@ def build_parser() -> argparse.ArgumentParser:
         if name in ("run", "train", "find-step", "simulate"):
             add_variants(command, "run only this variant of the scene; repeatable")
         add_job_options(command)
+    measure = add_command(commands, "measure", "numbers and small arrays of each rollout of a run directory; "
+                          "simulate does the same")
+    add_run(measure, "run")
+    add_log_options(measure)
     report = add_command(commands, "report", STAGES["report"].about)
     add_run(report, "run")
-    add_variants(report, "show this variant after the table of all variants; if given several times, the first one "
-                         "that was run")
+    add_variants(report, "show this variant in the figures; repeatable, up to six (default: the first six)")
     add_log_options(report)
     report.add_argument("--output", type=directory, metavar="DIR",
                         help="write the page there instead of RUN/report, for example if RUN is read-only")
@@ -398,4 +407,4 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
     how_much.add_argument("--quiet", action="store_const", const="outcome", dest="log",
                           help="log only warnings, and at the end the path of the product")
     how_much.add_argument("--verbose", action="store_const", const="debug", dest="log",
-                          help="log each step, and the time of frames, checkpoints and parts of the report")
+                          help="log each step, and the time of frames and checkpoints")

@@ -32,12 +32,8 @@ MEASURES = {
     "count_variance": "variance of counts / that of random points",
     "count_variance_floor": "variance of counts of the true tracers",
 }
-#: Measures in the figure (DRAWN) and in the table (SHOWN) of variants.
+#: Measures in the figure of error against run time.
 DRAWN = ("velocity_error_early", "velocity_error_half", "spectrum_error", "acceleration_kl")
-SHOWN = ("velocity_error_early", "velocity_error_half", "velocity_error_end", "spectrum_error", "energy_ratio",
-         "velocity_kl", "velocity_kl_floor", "acceleration_kl", "acceleration_kl_floor", "qr_kl", "qr_kl_floor",
-         "acceleration_error", "momentum_drift", "momentum_drift_floor", "density_drift", "density_drift_floor",
-         "count_variance", "count_variance_floor")
 
 
 def finite(value: Any) -> Any:

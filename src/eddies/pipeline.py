@@ -71,3 +71,5 @@ STAGES = {stage.name: stage for stage in (
 )}
 #: The stage that makes each kind of product.
 MAKER_OF = {stage.product: stage for stage in STAGES.values() if stage.product is not None}
+#: The file of each kind of product. The measures of a rollout, which the report draws, have no stage of their own.
+FILE_OF = {**{kind: stage.file for kind, stage in MAKER_OF.items()}, "measures": "measures.h5"}

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eddies.errors import UserError
-from eddies.pipeline import MAKER_OF
+from eddies.pipeline import FILE_OF
 from eddies.scene.rules import shortened
 from eddies.scene.scene import Scene, load_scene
 
@@ -42,13 +42,12 @@ class StoredRun:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         if not self.products:
-            raise UserError(f"{self.path}: holds none of {', '.join(stage.file for stage in MAKER_OF.values())}; run "
-                            "`eddies dns SCENE` first")
+            raise UserError(f"{self.path}: holds none of {', '.join(FILE_OF.values())}; run `eddies dns SCENE` first")
 
     @property
     def products(self) -> tuple[str, ...]:
         """Names of the existing products, such as "ground_truth", "kernel", "model", "rollout"."""
-        return tuple(name for name, stage in MAKER_OF.items() if (self.path / stage.file).is_file())
+        return tuple(name for name, file in FILE_OF.items() if (self.path / file).is_file())
 
     @property
     def groups(self) -> list[str]:
@@ -57,7 +56,7 @@ class StoredRun:
         from eddies.io.datasets import groups_in
         found = []
         for product in self.products:
-            with open_to_read(self.path / MAKER_OF[product].file) as file:
+            with open_to_read(self.path / FILE_OF[product]) as file:
                 found += [f"{product}/{group}" for group in groups_in(file)]
         return found + [name for name in MADE if name not in found and "rollout" in self.products]
 
@@ -68,7 +67,7 @@ class StoredRun:
         if product not in self.products:
             raise UserError(f"{self.path}: holds no {product}; it holds: {', '.join(self.products)}")
         return (self._made(group, MADE[name].split()) if name in MADE else
-                open_group(self.path / MAKER_OF[product].file, group))
+                open_group(self.path / FILE_OF[product], group))
 
     def _made(self, group: str, axes: list[str]) -> xarray.Dataset:
         """Return a group that is computed from the rollout, frame by frame."""
@@ -78,11 +77,11 @@ class StoredRun:
         from eddies.io.units import UNITS
         from eddies.workflows.rollout.measured import open_rollout
         with open_rollout(self.path, MPI.COMM_SELF) as measured:
-            if group not in measured.groups:
+            if group not in (groups := measured.groups()):
                 raise UserError(f"{self.path}: {group} needs rollout.h5 with its ground_truth.h5, and kernel.h5 for "
                                 "fields and gradients")
-            times = measured.groups[group].times
-            samples = {column: measured.groups[group].read(0, column) for column in measured.groups[group].columns}
+            times, columns = groups[group]
+            samples = {column: read(0) for column, read in columns.items()}
         arrays = {"time": (times, "time", "T")}
         counted = np.arange(len(next(iter(samples.values()))))
         if axes[1] == "wavenumber":
@@ -112,7 +111,7 @@ class StoredRun:
         if not path.is_file():
             raise UserError(f"{path}: no such file; run `eddies report {self.path}` first")
         made = path.stat().st_mtime
-        files = [MAKER_OF[name].file for name in self.products]
+        files = [FILE_OF[name] for name in self.products]
         newer = [file for file in files if (self.path / file).stat().st_mtime > made]
         if newer:
             warnings.warn(f"{path}: is older than {', '.join(newer)}; run `eddies report {self.path}` again",
@@ -164,7 +163,7 @@ class StoredRun:
         from mpi4py import MPI
 
         from eddies.workflows.report import sections_of
-        return {drawing.name: drawing.figure for section in sections_of(self.path, MPI.COMM_SELF)
+        return {drawing.name: drawing.make() for section in sections_of(self.path, MPI.COMM_SELF)
                 for drawing in section.illustrations}
 
     def __repr__(self) -> str:
@@ -214,5 +213,6 @@ def _measured(path: Path, group: str, column: str, frames: Iterable[int]) -> Ite
 
     from eddies.workflows.rollout.measured import open_rollout
     with open_rollout(path, MPI.COMM_SELF) as measured:
+        read = measured.groups()[group][1][column]
         for frame in frames:
-            yield np.asarray(measured.groups[group].read(frame, column))
+            yield np.asarray(read(frame))

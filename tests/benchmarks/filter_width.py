@@ -18,13 +18,13 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from eddies.measures import MEASURES
-from eddies.report.variants import in_symbols, is_stable
-from eddies.report.figures import DNS, FILTERED, FOURTH, MODEL, SECOND, THIRD, TRUTH, letter, panels, png, styled
+from eddies.report.summary import in_symbols, is_stable
+from eddies.report.figures import BLUE, DNS, FILTERED, FOURTH, MODEL, SECOND, THIRD, letter, panels, png, styled
 
 DRAWN = ("velocity_error_half", "acceleration_kl")
 # Label, colour and marker of the variants.
 MARKERS = {"resolved": ("the resolved velocity", MODEL, "o"),
-           "grid": ("best grid of its cost, exact start", TRUTH, "s"),
+           "grid": ("best grid of its cost, exact start", BLUE, "s"),
            "grid-particles": ("the same, start from particles", DNS, "^"),
            "paper": ("the published form", THIRD, "D"), "transport-velocity": ("transport-velocity SPH", FOURTH, "v"),
            "local": ("only neighbours", SECOND, "P"), "no-force": ("no force", FILTERED, "x")}

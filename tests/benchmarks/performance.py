@@ -32,7 +32,7 @@ from step import best, transform_bounds
 
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import planes_for, resolved_shells
-from eddies.report.figures import FOURTH, MODEL, SECOND, THIRD, TRUTH, letter, panels, png, styled
+from eddies.report.figures import BLUE, FOURTH, MODEL, SECOND, THIRD, letter, panels, png, styled
 from eddies.scene.scene import BOX_LENGTH, Scene, load_scene
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.estimates import estimate, most_ranks
@@ -301,7 +301,7 @@ def seconds_of(found: dict, model: str, ranks: int, threads: int) -> tuple[np.nd
 
 def over_particles(axis: Axes, found: dict) -> None:
     """Seconds per evaluation on two ranks, with slopes."""
-    for model, colour in zip(measured_models(found), (TRUTH, MODEL, FOURTH)):
+    for model, colour in zip(measured_models(found), (BLUE, MODEL, FOURTH)):
         side, seconds = seconds_of(found, model, 2, 1)
         slope = np.polyfit(np.log(side[2:] ** 3), np.log(seconds[2:]), 1)[0]
         axis.loglog(side**3, seconds, "o-", color=colour, label=f"{model}, slope {slope:.2f}")
@@ -327,7 +327,7 @@ def parts(axis: Axes, found: dict) -> None:
         values = [given.pop(name) for name in names[:-1]]
         label = f"{ranks} rank{'s' * (ranks > 1)}" + f" x {threads} threads" * (threads > 1)
         axis.bar(np.arange(5) + 0.27 * (number - 1), [*values, sum(given.values())], 0.25, label=label,
-                 color=(TRUTH, SECOND, MODEL)[number])
+                 color=(BLUE, SECOND, MODEL)[number])
     for place, name in enumerate(names[:3]):
         for shift, cores in ((-0.27, 1), (0.135, 2)):
             width = 0.25 if cores == 1 else 0.52
@@ -342,7 +342,7 @@ def parts(axis: Axes, found: dict) -> None:
 def over_cores(axis: Axes, found: dict) -> None:
     """Projection to more cores, and measurements on one and two."""
     sides = dict.fromkeys(row["particles"] for row in found["projected"])
-    for side, colour in zip(sides, (TRUTH, MODEL, SECOND, THIRD)):
+    for side, colour in zip(sides, (BLUE, MODEL, SECOND, THIRD)):
         rows = [row for row in found["projected"] if row["particles"] == side]
         axis.loglog([row["cores"] for row in rows], [row["seconds"] for row in rows], "--", color=colour,
                     label=f"{side}³")
@@ -350,7 +350,7 @@ def over_cores(axis: Axes, found: dict) -> None:
         axis.loglog([row["cores"] for row in threaded], [row["seconds"] for row in threaded], ".", color=colour)
     for ranks, threads in LAYOUTS:
         side, seconds = seconds_of(found, MODELS[1], ranks, threads)
-        axis.loglog(ranks * threads, seconds[side == 64], "s" if threads > 1 else "o", color=TRUTH)
+        axis.loglog(ranks * threads, seconds[side == 64], "s" if threads > 1 else "o", color=BLUE)
     axis.set(title="projected, with pairs", xlabel="cores", ylabel="seconds an evaluation")
     axis.legend(title="particles", loc="upper right")
 

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from matplotlib.text import Text
 
-from eddies.report.figures import BAR, POSITIVE, colour_bar, letter, panels, png, show_plane, styled
+from eddies.report.figures import (BAR, LOOKS, POSITIVE, colour_bar, letter, looks, panels, png, show_plane, styled)
 
 
 def test_drawing_leaves_the_settings_of_the_user(monkeypatch):
@@ -62,3 +62,14 @@ def test_wide_tick_labels_leave_room_for_the_label(draw, values):
     figure, axes = drawn()
     png(figure)
     assert axes[0, 0].yaxis.label.get_window_extent(figure.canvas.get_renderer()).x0 >= 0
+
+
+def test_each_method_has_one_colour_and_one_marker():
+    methods = {"paper": ["paper"], "forced": ["forced", "paper"], "mine": ["mine"], "free": ["free", "none"],
+               "grid-16": ["grid-16"], "grid-32": ["grid-32"]}
+    found = looks(methods, {"grid-16": 16, "grid-32": 32})
+    assert found["paper"] == LOOKS["paper"] and found["free"] == LOOKS["none"]
+    assert len(set(found.values())) == len(found)
+    assert found["grid-16"][1] == found["grid-32"][1] and found["grid-32"][0] == "#0072b2"
+    assert sum(int(found["grid-16"][0][at:at + 2], 16) for at in (1, 3, 5)) > 0x72 + 0xb2  # lighter
+    assert looks({"other": ["other", "paper"]}, {})["other"] == LOOKS["paper"]

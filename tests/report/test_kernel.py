@@ -15,7 +15,6 @@ KERNELS = {"learned": "", "learned_no_gradient": "no_gradient_", "cubic_spline":
 def test_each_kernel_has_its_own_errors():
     pairs = list(itertools.product(("velocity", "gradient"), KERNELS))
     errors = {f"{what}_error_{kernel}": number / 10 for number, (what, kernel) in enumerate(pairs)}
-    shown = section(1.0, {}, {}, {**errors, "integral_learned": 1.0})
-    found = {metric.key: metric.value for metric in shown.metrics}
+    found = section(1.0, {}, {}, {**errors, "integral_learned": 1.0}).numbers
     for what, kernel in pairs:
         assert found[f"{KERNELS[kernel]}{what}_error"] == errors[f"{what}_error_{kernel}"]

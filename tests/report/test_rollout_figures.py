@@ -1,43 +1,56 @@
-"""Figures of a rollout with few particles or frames."""
+"""Figures of rollouts with few particles or frames, and of several variants."""
 
 import numpy as np
 import pytest
 
-from eddies.analysis.against_truth import InvariantStatistics
-from eddies.analysis.rollout import Plane
-from eddies.analysis.velocity_gradients import ConditionalVelocity, Invariants
-from eddies.report.figures import png
-from eddies.report.rollout_figures import errors_over_time, invariant_plane, velocity_planes
+from eddies.analysis.pdfs import bin_centres
+from eddies.analysis.velocity_gradients import InvariantBins
+from eddies.report.figures import Variant, png
+from eddies.report.rollout_figures import errors_over_time, invariant_planes, row_at, velocity_planes
+
+NUMBERS = {"attributes": {"eddy_turnover_time": 1.0}}
+
+
+def drawn(label, tables):
+    return Variant(label, ("#D55E00", "o"), NUMBERS, tables)
 
 
 @pytest.mark.parametrize("particles", [8, 27, 64, 1000])
 def test_invariants_of_few_particles_are_drawn(particles):
+    """Also if no cell has enough of them for a mean motion."""
     rng = np.random.default_rng(1)
-    truth, model, later = (Invariants.of(rng.normal(size=(particles, 3, 3))) for _ in range(3))
-    statistics = InvariantStatistics.of(model, truth)
-    flows = tuple(ConditionalVelocity(statistics.bins.coarser()) for _ in range(2))
-    for flow, before in zip(flows, (model, truth)):
-        flow.add(before, later, 0.1, truth.scale)
-    for below in (None, flows):
-        figure = invariant_plane(statistics, below)
+    planes = {of: rng.normal(size=(2, particles)) for of in ("model", "truth")}
+    bins = InvariantBins.covering(*planes["truth"])
+    centres = {"second": bin_centres(bins.second), "third": bin_centres(bins.third)}
+    invariants = centres | {of: bins.density(bins.probabilities(*plane)) for of, plane in planes.items()}
+    rate = rng.normal(size=invariants["truth"].shape) * (1 if particles == 1000 else np.nan)
+    rates = centres | {f"{name}_rate_{of}": rate for name in ("second", "third") for of in planes}
+    for tables in ({"invariants": invariants}, {"invariants": invariants, "invariant_rates": rates}):
+        figure = invariant_planes([drawn("one", tables), drawn("two", tables)])
         assert png(figure).startswith(b"\x89PNG")
-        assert len(figure.axes[0].collections[0].levels) >= 2
+        assert len(figure.axes[0].collections[0].levels) >= 2 and len(figure.axes) == 4 * len(tables)
 
 
 @pytest.mark.parametrize("frames", [1, 2, 4])
 def test_planes_are_as_large_with_few_frames(frames):
-    plane = Plane(np.random.default_rng(2).normal(size=(3, 8, 8)), np.zeros((8, 8)))
-    figure = velocity_planes({"true tracers": [plane] * frames, "model": [plane] * frames}, 0.1 * np.arange(frames))
+    """Each variant has a row; the second one ends after its first frame."""
+    planes = np.random.default_rng(2).normal(size=(frames, 8, 8))
+    whole = {"time": 0.1 * np.arange(frames), "u_x_truth": planes, "u_x_model": planes}
+    short = {name: values[:1] for name, values in whole.items()}
+    figure = velocity_planes([drawn("whole", {"planes": whole}), drawn("short", {"planes": short})])
     png(figure)
     width = figure.axes[0].get_position().width * figure.get_figwidth()
-    assert width == pytest.approx(2.05, abs=0.06)
+    assert width == pytest.approx(2.0, abs=0.05)  # inches; the colour bar has room in any case
+    assert [len(axis.images) for axis in figure.axes[:3 * frames]] == [1] * (2 * frames + 1) + [0] * (frames - 1)
+    assert row_at(short, 0.0) == 0 and row_at(whole, 0.1 * frames) is None
 
 
 def test_the_density_is_drawn_if_model_and_truth_have_one():
     time = np.arange(3.0)
     without = {"time": time, "energy": time + 1}
     dense = without | {"density_rms": time}
-    errors = dict.fromkeys(("time", "velocity_error", "no_force", "velocity_kl", "acceleration_kl"), time)
-    for model, truth, panels in ((dense, dense, 4), (dense, without, 3), (without, dense, 3)):
-        titles = [axis.get_title(loc="left")[4:] for axis in errors_over_time(model, truth, errors, 1.0).axes]
-        assert titles == ["Kinetic energy", "Velocity error", "PDF divergence", "Density fluctuation"][:panels]
+    errors = {**dict.fromkeys(("velocity_error", "no_force", "velocity_kl", "acceleration_kl"), time + 1), "time": time}
+    for model, truth, lines in ((dense, dense, 2), (without, dense, 1), (dense, without, 0)):
+        figure = errors_over_time([drawn("one", {"model": model, "truth": truth, "errors": errors})])
+        found = [axis for axis in figure.axes if axis.get_title(loc="left").endswith("Density fluctuation")]
+        assert sum(len(axis.lines) for axis in found) == lines and len(figure.axes) == 4 + bool(lines)

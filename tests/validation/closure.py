@@ -24,7 +24,7 @@ from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.model import build_model
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import WEIGHT, ResolvedVelocity
-from eddies.report.figures import DNS, FOURTH, GUIDE, MODEL, SECOND, TRUTH, letter, panels, png, styled
+from eddies.report.figures import BLUE, DNS, FOURTH, GUIDE, MODEL, SECOND, letter, panels, png, styled
 from eddies.scene.terms import Pressure, Stress, Viscosity
 from eddies.workflows.ground_truth.truth import GroundTruth
 
@@ -86,7 +86,7 @@ def figure(found):
         for weight, colour in WEIGHTS.items():
             errors = np.array(case["by_weight"][f"{weight:g}"])[:, 0]
             axis.plot(share, errors, "o-", color=colour, markersize=3.5, label=f"weight {weight:g}")
-        axis.plot(share, np.array(case["gradient"])[:, 0], "s--", color=TRUTH, markersize=3.5, label="gradient stress")
+        axis.plot(share, np.array(case["gradient"])[:, 0], "s--", color=BLUE, markersize=3.5, label="gradient stress")
         axis.axvline(case["chosen"] / case["nyquist"], color=GUIDE, linewidth=0.8, label="the choice")
         axis.set(yscale="log", xlabel="$k_c$ / Nyquist wavenumber", title=name)
         axes[0, -1].plot(case["iterations"], case["by_iterations"], next(markers), color=DNS, markersize=4,

@@ -38,14 +38,14 @@ from eddies.flow.stability import (
 )
 from eddies.flow.statistics import energy_spectrum, gradient_moments, incompressible_budget
 from eddies.parallel.reduction import global_max
-from eddies.report.figures import GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled
+from eddies.report.figures import BLUE, GUIDE, MODEL, SECOND, THIRD, letter, panels, styled
 from eddies.time_stepping import ETDRK4, STEPPERS
 
 TURBULENT_STEPS = 60
 HIGHEST = 8.0  # of the advective numbers that are tried
 ANY, PERCENT = 1e-6, 1e-2  # growths a step: as good as none; one that a little viscosity stops
 NAMES = {"etdrk4": "ETDRK4", "rk4": "RK4"}
-COLOURS = {("etdrk4", ANY): TRUTH, ("etdrk4", PERCENT): SECOND, ("rk4", ANY): MODEL}
+COLOURS = {("etdrk4", ANY): BLUE, ("etdrk4", PERCENT): SECOND, ("rk4", ANY): MODEL}
 
 MACH_NUMBERS, DURATION, SKEWNESS = (0.04, 0.08, 0.16), 0.5, -0.4  # the start has developed at this skewness
 # Steps in parts of the theoretical limit of stability; the shortest of ETDRK4 is the reference.
@@ -162,7 +162,7 @@ def growth_panel(axis, rows):
     for factor in (amplification("rk4", 0 * number, number), amplification("rk4", -number, 0 * number)):
         axis.plot(number, np.abs(factor), color=GUIDE)
     for (stepper, limit), marker, colour in zip([("etdrk4", "advection"), ("rk4", "advection"), ("rk4", "sound"),
-                                                 ("rk4", "viscosity")], "os^v", (TRUTH, MODEL, THIRD, SECOND)):
+                                                 ("rk4", "viscosity")], "os^v", (BLUE, MODEL, THIRD, SECOND)):
         own = [row for row in rows if (row["stepper"], row["limit"]) == (stepper, limit)]
         axis.plot([row["number"] for row in own], [row["measured"] for row in own], marker, markersize=4,
                   color=colour, label=f"{NAMES[stepper]}, {limit}")
@@ -190,7 +190,7 @@ def boundary_panel(axis, rows, stiffness, values, limits):
 
 def turbulence_panel(axis, rows):
     """Longest step of turbulence against the Mach number."""
-    for stepper, colour in (("etdrk4", TRUTH), ("rk4", MODEL)):
+    for stepper, colour in (("etdrk4", BLUE), ("rk4", MODEL)):
         own = [row for row in rows if row["stepper"] == stepper]
         mach = [row["mach_turbulent"] for row in own]
         axis.loglog(mach, [row["theory"] for row in own], color=colour, linewidth=1.2)
@@ -283,7 +283,7 @@ def draw_errors(found, path):
     figure, axes = panels(1, len(found), (3.25, 3.2), sharex=True, sharey=True)
     figure.set_layout_engine("constrained")  # for labels and legends that are wide
     for (mach, runs), axis in zip(found.items(), axes.flat):
-        for stepper, colour, marker in (("etdrk4", TRUTH, "o"), ("rk4", MODEL, "s")):
+        for stepper, colour, marker in (("etdrk4", BLUE, "o"), ("rk4", MODEL, "s")):
             stable = [run for run in runs[:-1] if run["stepper"] == stepper and "density" in run]
             for quantity, style in (("density", "-"), ("spectrum", "--")):
                 axis.loglog([run["seconds"] for run in stable], [run[quantity] for run in stable], style, color=colour,

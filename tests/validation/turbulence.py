@@ -35,18 +35,18 @@ from mpi4py import MPI
 from eddies.analysis.isotropic_turbulence import Row, StationarySpan, comparison
 from eddies.io.hdf5 import open_product, read_table
 from eddies.report.figures import (
-    DNS, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, number_wavenumbers, panels, styled,
+    BLUE, DNS, FOURTH, GUIDE, MODEL, SECOND, THIRD, letter, number_wavenumbers, panels, styled,
 )
 from eddies.report.page import shown
 from eddies.report.stationary import draw_compensated
 from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.stored_run import open_run
-from eddies.workflows.report import read_stationary_span
+from eddies.workflows.ground_truth.stationary import read_stationary_span
 
 NOMINAL = (0.04, 0.08, 0.16)  # turbulent Mach numbers of the paper's Table 1
 MEASURED, STEPS = 0.05, 0.1  # how far M_t and the steps per turnover may be off
-COLOURS = (TRUTH, MODEL, SECOND, THIRD, DNS)
-SCALED = {"density_rms": (r"$\rho_{rms}/\rho_0$", TRUTH, "o"), "compressible_velocity": (r"$\sqrt{\chi}$", MODEL, "s")}
+COLOURS = (BLUE, MODEL, SECOND, THIRD, DNS)
+SCALED = {"density_rms": (r"$\rho_{rms}/\rho_0$", BLUE, "o"), "compressible_velocity": (r"$\sqrt{\chi}$", MODEL, "s")}
 # Johns Hopkins Turbulence Databases, isotropic1024coarse, Re_lambda 417 to 433 (Li et al., J. Turbulence 9, N31, 2008;
 # Perlman et al. 2007): k eta and the compensated spectrum, with nu = 1.85e-4, eps = 0.1031 and eta = 0.0028.
 JOHNS_HOPKINS = {0.02: 1.59, 0.05: 1.77, 0.1: 2.08, 0.126: 2.17, 0.2: 1.90, 0.5: 0.522, 1.0: 0.0533}
@@ -134,7 +134,7 @@ def draw(runs: list[Run]) -> Figure:
         measured.axhline(limit, color=GUIDE, linestyle=":", linewidth=1)
     deviations = [run.rows["mach_turbulent"].deviation / run.nominal for run in runs]
     measured.errorbar([run.nominal for run in runs], [run.mach / run.nominal for run in runs], deviations, fmt="o",
-                      color=TRUTH, capsize=3)
+                      color=BLUE, capsize=3)
     measured.set(title="Turbulent Mach number", xlabel="nominal $M_t$", ylabel="measured / nominal", xscale="log")
     measured.margins(y=0.3)
     reach = np.array([mach.min() / 1.2, mach.max() * 1.2])
@@ -149,7 +149,7 @@ def draw(runs: list[Run]) -> Figure:
     counts = np.array([run.span.steps_per_turnover for run in runs])
     for limit in (1 - STEPS / 2, 1 + STEPS / 2):
         steps.axhline(limit * counts.mean(), color=GUIDE, linestyle=":", linewidth=1)
-    steps.plot(mach, counts, "o", color=TRUTH)
+    steps.plot(mach, counts, "o", color=BLUE)
     steps.set(title="Cost", xlabel="$M_t$", ylabel="steps per turnover", xscale="log",
               ylim=(0, 1.3 * counts.max()))
     for axis in (measured, scaled, steps):
@@ -251,7 +251,7 @@ def draw_grid(found: dict[str, dict[int, np.ndarray]], grids: set[str], shells: 
     count = len(found) - len(grids)
     colours = dict(zip(order, [*GRID_COLOURS[:count], *GRID_COLOURS[:len(grids)]]))
     for axis, station in zip(axes.flat, ENERGY):
-        axis.loglog(shells, filtered_experiment(station, shells, filter_width), "o", color=TRUTH, label="experiment")
+        axis.loglog(shells, filtered_experiment(station, shells, filter_width), "o", color=BLUE, label="experiment")
         for name in order:
             axis.loglog(shells, found[name][station].mean(0), "--" if name in grids else "-", color=colours[name],
                         label=name)

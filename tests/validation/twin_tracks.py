@@ -212,7 +212,7 @@ def forecasts_of(tracks: str, weights: str, run: Path, seed: int) -> dict[str, d
     rest = FORECAST.format(weights=weights, interval=step * int(limit / step))
     rest += "".join(GRID.format(cells=cells) for cells in (32, 48))
     with made(Case(tracks), run, seed, rest) as directory:
-        rows = json.loads((directory / "report/variants.json").read_text(encoding="utf-8"))["rows"]
+        rows = json.loads((directory / "report/metrics.json").read_text(encoding="utf-8"))["rows"]
     return {row["name"]: {key: row[key] for key in COLUMNS} for row in rows}
 
 
@@ -236,7 +236,7 @@ def learned_of(tracks: str, run: Path, seed: int) -> dict[str, float | None]:
                 mine, exact = (each[late] for each in values)
                 found[f"particle_{name}_error"] = float(np.mean(
                     np.linalg.norm(mine - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))))
-            row, = json.loads((directory / "report/variants.json").read_text(encoding="utf-8"))["rows"]
+            row, = json.loads((directory / "report/metrics.json").read_text(encoding="utf-8"))["rows"]
             found |= {key: row[key] for key in COLUMNS}
     return comm.bcast(found)
 

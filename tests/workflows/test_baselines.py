@@ -7,7 +7,7 @@ import pytest
 from mpi4py import MPI
 
 from eddies.io.weights import load_weights
-from eddies.report.rollout import moved_by
+from eddies.report.rollouts import moved_by
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import train
 from eddies.workflows import simulate as stage

@@ -5,13 +5,11 @@ import shutil
 import numpy as np
 import pytest
 
-from eddies.analysis.against_truth import accuracy
 from eddies.flow.initial_fields import random_velocity
 from eddies.io.hdf5 import open_product, read_attributes
 from eddies.io.weights import load_weights
 from eddies.scene.scene import load_scene
-from eddies.workflows import simulate, train
-from eddies.workflows.rollout.measured import open_rollout
+from eddies.workflows import measure, simulate, train
 from tests.commands import first_rank
 from tests.changed_product import changed
 from tests.workflows.small_rollout import prepared
@@ -69,11 +67,10 @@ def test_a_mean_velocity_changes_neither_training_nor_errors(comm, truths, prese
         simulate.run(scene, comm, directory)
         comm.Barrier()
         alone = comm.Split(comm.rank)
-        with open_rollout(directory, alone) as measured:
-            found = accuracy(measured.rollout)
-            assert measured.rollout.status == "complete"
+        numbers, _ = measure.read(directory, alone)
         alone.Free()
-        errors.append([found[name] for name in ERRORS])
+        assert numbers["rollout"]["status"] == "complete"
+        errors.append([numbers["accuracy"][name] for name in ERRORS])
     if not grid:
         still, moving = (np.concatenate([values.ravel() for values in each.values()]) for each in weights)
         # Adam moves also those few weights whose gradient is round-off.

@@ -17,6 +17,7 @@ from eddies.learning.training import shared_values
 from eddies.scene.model import BUILT_IN_PREFIX, WEIGHTS, built_in_weights
 from eddies.scene.scene import load_scene
 from eddies.stored_run import open_run
+from eddies.workflows.diff import numbers_of
 from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.learned.training_data import training_data
@@ -51,9 +52,9 @@ def run_directory(comm, shared_folder):
 
 
 def test_metrics_are_finite_and_within_bounds(run_directory):
-    metrics = json.loads((run_directory / "report" / "metrics.json").read_text())
+    metrics = numbers_of(run_directory, None)
     assert all(math.isfinite(value) for value in numbers(metrics))
-    truth, kernel, model, rollout = (metrics[key] for key in ("ground_truth", "kernel", "model", "rollout"))
+    truth, kernel, model, rollout = (metrics[key] for key in ("ground_truth", "kernel", "models", "rollouts"))
     assert truth["energy_budget_error"] < 2e-3 and truth["kmax_eta"] > 0.9 and 0.05 < truth["mach_turbulent"] < 0.12
     assert kernel["integral"] == pytest.approx(1, abs=1e-5)
     # After thirty steps the error is below that without a model, which is 1.
@@ -61,7 +62,7 @@ def test_metrics_are_finite_and_within_bounds(run_directory):
     assert rollout["stable"] and 0.5 < rollout["energy_ratio"] < 1.5
     assert rollout["closure_not_converged"] == 0 and 0.3 < rollout["closure_iterations"] < 10
     # Three in each of nine steps, and one at the start.
-    assert metrics["cost"]["evaluations_per_turnover"] == pytest.approx(28 / rollout["turnovers"])
+    assert rollout["evaluations_per_turnover"] == pytest.approx(28 / rollout["turnovers"])
     assert rollout["velocity_error"] < 0.95 * error_of_frozen_velocities(run_directory)
     with h5py.File(run_directory / "ground_truth.h5") as file:
         end, turnover = file["statistics/time"][-1], file["reference"].attrs["eddy_turnover_time"]
@@ -123,8 +124,7 @@ def test_pairs_outside_the_training_data_are_counted(run_directory):
         assert np.array_equal(file["outside_training/time"], file["particles/model/position/time"])
     # The particles start from the flow that the network was trained on, a little later.
     assert np.all((0 <= share) & (share < 0.01))
-    shown = json.loads((run_directory / "report" / "metrics.json").read_text())
-    assert shown["rollout"]["outside_training"] == share.max()
+    assert numbers_of(run_directory, None)["rollouts"]["outside_training"] == share.max()
 
 
 def test_weights_that_come_along_are_as_good_as_their_card_says(run_directory, linked, tmp_path):
@@ -166,7 +166,8 @@ def test_what_fits_is_kept_and_what_changed_is_redone(comm, run_directory, capfd
     comm.Barrier()
     log = capfd.readouterr().out
     assert comm.rank > 0 or log.count("skipped") == 3 and "; complete\n" in log
-    assert [path.name for path, time in before.items() if path.stat().st_mtime_ns != time] == ["rollout.h5"]
+    replaced = {path.name for path, time in before.items() if path.stat().st_mtime_ns != time}
+    assert replaced == {"rollout.h5", "measures.h5"}
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -188,8 +189,8 @@ def test_a_trained_model_runs_on_another_flow(comm, run_directory, tmp_path):
     with h5py.File(tmp_path / "run" / "rollout.h5") as file:
         rollout = dict(file["rollout"].attrs)
         assert rollout["start_time"] == pytest.approx(0.1) and python_value(rollout["status"]) == "complete"
-    metrics = json.loads((tmp_path / "run" / "report" / "metrics.json").read_text())
-    shown = metrics["model"]
+    metrics = numbers_of(tmp_path / "run", None)
+    shown = metrics["models"]
     assert metrics["warnings"] == []
     assert shown["acceleration_error"] < 0.95 and shown["source_acceleration_error"] < 0.9
     assert shown["mach_turbulent"] == pytest.approx(2 * shown["source_mach_turbulent"], rel=0.2)

@@ -1,13 +1,18 @@
 """Warnings about products that do not belong together, and about numbers that are not finite."""
 
+import json
+
 import numpy as np
 import pytest
 
 from eddies.io.hdf5 import open_product
 from eddies.io.provenance import product_provenance
-from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite
+from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite, old_products
+from eddies.workflows.run_directory.fingerprints import stage_provenance
+from eddies.workflows.status import status_lines
 from tests.changed_product import changed
-from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_model, write_rollout
+from tests.small_scene import one_model
+from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_model, write_rollout, write_run
 
 TRUTH = {"id": "t1", "made_from": {}, "date": "2030-01-01", "scene": "seed = 1\n[flow]\ncells = 48"}
 MODEL = {"id": "m1", "made_from": {"ground_truth": "t1"}, "date": "2030-01-02", "scene": TRUTH["scene"]}
@@ -78,3 +83,24 @@ def test_numbers_that_are_not_finite_are_placed(comm, tmp_path):
 def test_a_rollout_that_was_stopped_gives_the_reason(comm, tmp_path, status, remedy):
     write_rollout(comm, tmp_path, status=status, broken=8)
     assert f"(particles/model/velocity/value, frame 8): {remedy}" in warning_of(comm, tmp_path, "rollout")
+
+
+@pytest.mark.mpi(1)
+def test_files_that_are_not_found_from_here_make_no_product_old(comm, tmp_path, monkeypatch):
+    """A stored scene may name them relative to another working directory."""
+    there, here = tmp_path / "there", tmp_path / "here"
+    for folder in (there, here):
+        folder.mkdir()
+    (there / "start.h5").write_text("state")
+    monkeypatch.chdir(there)
+    scene = one_model("tiny", ["initial.kind=file", "initial.path=start.h5"],
+                      ["initial.amplitude", "initial.peak_wavenumber"])
+    write_run(comm, tmp_path / "run")
+    (tmp_path / "run/scene.toml").write_text(scene.to_toml())
+    for product, stage in (("ground_truth", "dns"), ("rollout", "simulate")):
+        with changed(tmp_path / f"run/{product}.h5") as file:
+            origin = json.loads(file.attrs["provenance"]) | stage_provenance(scene, stage) | {"made_from": {}}
+            file.attrs["provenance"] = json.dumps(origin)
+    monkeypatch.chdir(here)
+    assert old_products(scene, tmp_path / "run").keys() == {tmp_path / "run/kernel.h5", tmp_path / "run/model.h5"}
+    assert any("not found from here" in line for line in status_lines(tmp_path / "run"))

@@ -55,16 +55,18 @@ def test_settings_and_numbers_that_differ(tmp_path):
     one, other = tmp_path / "one", tmp_path / "other"
     write_scene(one)
     write_scene(other, "training.steps=90", "simulation.step=0.05")
-    lines = [line.split() for line in diff_lines(one, other)]
+    lines = [line.split() for line in diff_lines((one, None), (other, None))]
     assert "`eddies" in lines[-1] and ["training.steps", "60", "90"] in lines
     assert not any("flow.cells" in line for line in lines)
     for path, error in ((one, 0.2), (other, 0.1)):
         (path / "report").mkdir()
-        numbers = {"warnings": [], "rollout": {"error": error, "same": 1.0}}
+        numbers = {"warnings": [], "rollouts": {path.name: {"error": error, "same": 1.0}},
+                   "rows": [{"name": path.name, "energy": error}]}
         (path / "report/metrics.json").write_text(json.dumps(numbers))
-    lines = [line.split() for line in diff_lines(one, other)]
-    assert ["rollout.error", "0.2", "0.1", "0.5"] in lines and not any("rollout.same" in line for line in lines)
-    assert diff_lines(one, one) == ["no setting differs", "", "no number differs"]
+    lines = [line.split() for line in diff_lines((one, None), (other, None))]
+    assert ["rollouts.error", "0.2", "0.1", "0.5"] in lines and ["row.energy", "0.2", "0.1", "0.5"] in lines
+    assert not any("rollouts.same" in line for line in lines)
+    assert diff_lines((one, None), (one, None)) == ["no setting differs", "", "no number differs"]
 
 
 @pytest.mark.mpi(1)

@@ -11,6 +11,7 @@ from eddies.io.errors import ProductError
 from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import export, tracks
+from eddies.workflows.diff import numbers_of
 from eddies.workflows.ground_truth.track_frames import read_measured
 from tests.commands import first_rank
 from tests.workflows.small_rollout import prepared
@@ -179,7 +180,8 @@ learning_rate = 1e-2
     errors = stored["model/a_priori"]
     assert np.all(np.asarray(errors["acceleration_error"]) < 0.95)  # without a model it is 1
     assert np.asarray(errors["delay"])[-1] > 0
-    assert stored.metrics["model"]["acceleration_error"] == pytest.approx(float(errors["acceleration_error"][-1]))
+    shown = numbers_of(stored.path, None)["models"]["acceleration_error"]
+    assert shown == pytest.approx(float(errors["acceleration_error"][-1]))
 
 
 @pytest.mark.mpi(1, 2)
@@ -230,8 +232,8 @@ def test_a_model_learns_from_tracks_of_the_whole_flow(comm, tmp_path, no_figures
             f'[simulation]\nframe_interval = {2 * (times[1] - times[0])}\nturnovers = 0.05\nstep = 0.05\n')
     comm.Barrier()
     run(tmp_path / "mine.toml", output=tmp_path / "run", comm=comm)
-    metrics = json.loads((tmp_path / "run/report/metrics.json").read_text())
-    assert metrics["rollout"]["status"] == "complete" and metrics["model"]["acceleration_error"] < 0.5
+    metrics = numbers_of(tmp_path / "run", None)
+    assert metrics["rollouts"]["status"] == "complete" and metrics["models"]["acceleration_error"] < 0.5
     with h5py.File(tmp_path / "run/ground_truth.h5") as own, h5py.File(
             tmp_path / "flow/smooth/ground_truth.h5") as true:
         found, exact = (file["particles/tracers/velocity/value"][()] for file in (own, true))

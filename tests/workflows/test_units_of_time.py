@@ -1,18 +1,21 @@
 """A flow in another unit of time has the same numbers without dimension, from the direct simulation to the report."""
 
-import json
 import math
 
 import pytest
 
 from eddies import run
 from eddies.scene.scene import load_scene
+from eddies.workflows.diff import numbers_of
 from tests.workflows.small_rollout import scene_text
 
 # Powers of the unit of time in the numbers of a report. All others have no dimension.
-POWERS = {"energy": -2, "dissipation_rate": -3, "eddy_turnover_time": 1, "kolmogorov_time": 1, "velocity_rms": -1,
-          "acceleration_rms": -2, "delay": 1, "time step": 1}
-OF_THE_COMPUTER = ("second", "(s)", "storing", "cheaper", "warnings")  # warnings name the time of a product
+POWERS = {**dict.fromkeys(("energy", "energy_x", "energy_y", "energy_z", "total_energy", "acceleration_rms"), -2),
+          "dissipation_rate": -3, "injection_rate": -3,
+          **dict.fromkeys(("eddy_turnover_time", "kolmogorov_time", "released_at", "delay", "time_step"), 1),
+          **dict.fromkeys(("velocity_rms", "density_rate_rms", "sound_speed", "viscosity"), -1)}
+# Warnings name the time of a product, and the summary that of a turnover.
+OF_THE_COMPUTER = ("second", "storing", "break_even", "date", "warnings", "summary")
 
 
 def numbers(values, place=()):
@@ -32,7 +35,7 @@ def metrics_of(comm, folder, unit):
     folder.mkdir()
     (folder / "own.toml").write_text(scene_text())
     run(load_scene(folder / "own.toml", own), output=folder / "run", comm=comm)
-    return dict(numbers(json.loads((folder / "run/report/metrics.json").read_text())))
+    return dict(numbers(numbers_of(folder / "run", None)))
 
 
 @pytest.mark.mpi(1)

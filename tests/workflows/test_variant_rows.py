@@ -1,5 +1,6 @@
 """Rows of the table of variants, and the notes on them."""
 
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from eddies.io.weights import save_weights
 from eddies.measures import MEASURES
 from eddies.scene.scene import load_scene
 from eddies.workflows.variant_rows import (BEFORE, BREAK_EVEN, SEARCH, THROUGH_KERNEL, add_break_even, before, combined,
-                                           missing_reason, notes, rows_of, simulation_seconds, step_costs)
+                                           missing_reason, notes, numbers, rows_of, simulation_seconds)
 from tests.small_scene import TINY
 
 HEAD = f'base = "{TINY}"\nsimulation.turnovers = 0.25\nkernel.steps = 50\n'
@@ -49,7 +50,7 @@ def test_numbers_of_another_kernel_are_left_out(tmp_path, change):
                               dict.fromkeys(scene.variant, [REALISED]), None)
     assert [{measure for measure in MEASURES if row[measure] is None} for row in rows] == [
         set(), set(), set(THROUGH_KERNEL)]
-    _, note = notes((), different, {}, {})
+    _, note = notes((), different, {})
     assert note.startswith("own: no ") and all(MEASURES[name] in note for name in THROUGH_KERNEL)
 
 
@@ -61,23 +62,29 @@ def test_a_variant_without_a_rollout_says_why(tmp_path):
 
 
 def test_a_turnover_costs_as_much_as_its_steps():
-    rollout = {"seconds_per_step": 0.3, "seconds_per_step_low": 0.2, "seconds_per_step_high": 0.5, "time_step": 0.1}
-    found = step_costs(rollout, turnover=2.0, ranks=3)
+    rollout = {"seconds_per_step": 0.3, "seconds_per_step_low": 0.2, "seconds_per_step_high": 0.5, "time_step": 0.1,
+               "eddy_turnover_time": 2.0, "status": "complete"}
+    found = numbers({"attributes": rollout, "ranks": 3, "accuracy": {"velocity_kl": 0.5}})
     assert [found[f"wall_seconds{end}"] for end in ("", "_low", "_high")] == pytest.approx([6.0, 4.0, 10.0])
     assert found["core_seconds"] == pytest.approx(18.0)
+    assert (found["stopped_at"], found["velocity_kl"]) == (None, 0.5)
+    stopped = numbers({"attributes": {"status": "stopped: here", "turnovers": 0.3}, "ranks": 3, "accuracy": {}})
+    assert stopped == {"status": "stopped: here", "ranks": 3, "stopped_at": 0.3, "time_step": None}
 
 
 def test_a_note_says_how_many_flows_the_numbers_are_of():
-    (one,), (several,) = notes((), [], {}, {}), notes((2, 5), [], {}, {})
+    (one,), (several,) = notes((), [], {}), notes((2, 5), [], {})
     assert "one realisation" in one and "2 realisations, seeds 2, 5" in several
 
 
-def test_notes_on_the_wavenumbers_that_grids_keep_and_on_different_particles():
-    tracers = {name: load_scene(TINY).tracers for name in ("grid-18", "grid-16", "plain")}
+def test_notes_on_the_wavenumbers_that_grids_keep_and_on_different_particles(tmp_path):
+    grids = [(f"grid-{cells}", 'simulation.method = "eulerian"', f"eulerian.cells = {cells}") for cells in (18, 16)]
+    variants = scene_of(tmp_path, *grids).variant
     # A grid of 18 cells does not keep the mode 18/3 = 6.
-    _, note = notes((), [], tracers, {"grid-18": 18, "grid-16": 16, "plain": 0})
+    _, note = notes((), [], variants)
     assert "5 in grid-18, 5 in grid-16; the filter wavenumber k_d = pi/d is 3." in note
-    *_, note = notes((), [], tracers | {"few": tracers["plain"].with_count(27)}, {})
+    few = SimpleNamespace(coarse_cells=0, tracers=variants["plain"].tracers.with_count(27))
+    *_, note = notes((), [], {**variants, "few": few})
     assert note.startswith("Variants have different particles")
 
 

@@ -1,79 +1,17 @@
-"""A rollout beside the true tracers: measures, time series, PDFs, and invariants of the velocity gradient."""
+"""Comparison of a rollout with the true tracers: time series, PDFs, and invariants of the velocity gradient."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from eddies.analysis.disorder import drifts
-from eddies.analysis.errors import fluctuations, normalized_l2, velocity_error
-from eddies.analysis.lagrangian import differences, of_both
+from eddies.analysis.errors import fluctuations, velocity_error
 from eddies.analysis.pdfs import bin_edges, bin_probabilities, kl_divergence, sampling_divergence, standardized
 from eddies.analysis.rollout import Frames, Pair, Rollout
 from eddies.analysis.velocity_gradients import ConditionalVelocity, InvariantBins, Invariants
-from eddies.measures import MEASURES
 
 # Edges of the bins of the PDFs, in standard deviations of the truth.
 EDGES = {"velocity": bin_edges(5, 60), "acceleration": bin_edges(8, 80)}
-
-
-def accuracy(run: Rollout) -> dict[str, float | None]:
-    """Return the measures of a rollout by their keys in MEASURES, and the end of the comparison by the key `end`.
-
-    The end is the last time that model and truth have in common, in units of the turnover time T. A measure is None if
-    its data are missing, for example because the rollout or the truth ends too early. Velocity errors are normalised L2
-    errors over all particles; they and the energy leave the mean velocity out. Those at the Kolmogorov time t_eta and
-    at T/2 are interpolated linearly between frames. The acceleration error is that of the first common frame. The other
-    measures are taken at the last common frame or, if they are Lagrangian statistics, over all common frames. These are
-    None for a rollout that stops early or has a frame that is not finite, because such a rollout ends earlier than the
-    others.
-    """
-    measures: dict[str, float | None] = dict.fromkeys(MEASURES)
-    try:
-        end = float(run.common.times[-1]) / run.turnover
-    except ValueError:  # no finite frame
-        return measures | {"end": None}
-    start = run.pair(0, "acceleration")
-    measures |= {"velocity_error_early": _velocity_error_at(run, run.reference["kolmogorov_time"]),
-                 "velocity_error_half": _velocity_error_at(run, run.turnover / 2),
-                 "acceleration_error": normalized_l2(start.model, start.truth)}
-    if run.status == "complete" and not np.isfinite(run.broken):
-        measures |= _at_the_end(run)
-    return measures | {"end": end}
-
-
-def _velocity_error_at(run: Rollout, time: float) -> float | None:
-    times = run.common.times
-    above = int(np.searchsorted(times, time))
-    if above == times.size or time < times[0]:
-        return None
-    around = [index for index in (above - 1, above) if index >= 0]
-    pairs = [run.pair(index, "velocity") for index in around]
-    return float(np.interp(time, times[around], [velocity_error(pair.model, pair.truth) for pair in pairs]))
-
-
-def _at_the_end(run: Rollout) -> Mapping[str, float | None]:
-    last = run.common.times.size - 1
-    velocity, acceleration = (run.pair(last, name) for name in ("velocity", "acceleration"))
-    measures: dict[str, float | None] = {
-        "velocity_error_end": velocity_error(velocity.model, velocity.truth),
-        "energy_ratio": float(np.sum(fluctuations(velocity.model) ** 2) / np.sum(fluctuations(velocity.truth) ** 2)),
-        "velocity_kl": pdf_divergence(velocity, EDGES["velocity"]),
-        "velocity_kl_floor": sampling_floor(velocity, EDGES["velocity"]),
-        "acceleration_kl": pdf_divergence(acceleration, EDGES["acceleration"]),
-        "acceleration_kl_floor": sampling_floor(acceleration, EDGES["acceleration"]),
-        **differences(*of_both(run)),
-    }
-    for name, both in drifts(run).items():
-        measures |= {name: both["model"], f"{name}_floor": both["truth"]}
-    if last in run.spectral():
-        spectra = run.spectra_at(last)
-        measures |= {"spectrum_error": spectra.error("model", run.filter_wavenumber),
-                     "spectrum_error_floor": spectra.error("truth", run.filter_wavenumber)}
-    if run.invariants is not None:
-        invariants = last_invariants(run)
-        measures |= {"qr_kl": invariants.divergence, "qr_kl_floor": invariants.floor}
-    return measures
 
 
 def mean_energy(frames: Frames, frame: int) -> float:
@@ -101,9 +39,9 @@ def error_series(run: Rollout) -> dict[str, np.ndarray]:
     frame. `velocity_kl` and `acceleration_kl` are values of `pdf_divergence`.
     """
     rows, first = [], run.pair(0, "velocity").truth
-    for index in range(run.common.times.size):
+    for index, time in enumerate(run.common.times):
         velocity, acceleration = run.pair(index, "velocity"), run.pair(index, "acceleration")
-        rows.append((velocity.time, velocity_error(velocity.model, velocity.truth),
+        rows.append((time, velocity_error(velocity.model, velocity.truth),
                      pdf_divergence(velocity, EDGES["velocity"]),
                      pdf_divergence(acceleration, EDGES["acceleration"]), velocity_error(first, velocity.truth)))
     names = ("time", "velocity_error", "velocity_kl", "acceleration_kl", "no_force")

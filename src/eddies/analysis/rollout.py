@@ -3,16 +3,14 @@
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from eddies.analysis.errors import band_ratios, spectrum_error
 from eddies.analysis.velocity_gradients import Invariants
 from eddies.clock import ROUND_OFF, SAME
 
-SHOWN = 3   # largest number of times at which a report shows spectra of a rollout
-PLANES = 4  # largest number of times at which a report shows planes of a rollout
+SHOWN = 3  # largest number of times at which spectra of a rollout are measured
 # Columns by name. A table of spectra has wavenumber (shells,), time (m,), energy (m, shells).
 Table = Mapping[str, np.ndarray]
 
@@ -40,77 +38,19 @@ class Frames(Protocol):
         """Return the rows start, ..., stop - 1 of a column in a frame. Rows are particles in order of id."""
 
 
-@dataclass(frozen=True)
-class CommonFrames:
+class CommonFrames(NamedTuple):
     """Frames of model and truth at the same times: the frame numbers of both, and these times, each (m,)."""
 
     model: np.ndarray
     truth: np.ndarray
     times: np.ndarray
 
-    @classmethod
-    def of(cls, model: Frames, truth: Frames, until: float = np.inf) -> "CommonFrames":
-        """Pair the frames before `until` that have the `same_times`. Raises ValueError if there are none."""
-        rows, columns = same_times(model.times, truth.times)
-        early = model.times[rows] < until
-        if not early.any():
-            raise ValueError("there is no time at which model and truth both have finite values")
-        return cls(rows[early], columns[early], model.times[rows[early]])
 
-    def spread(self, count: int) -> np.ndarray:
-        """Return the indices of at most `count` common frames, evenly spread from the first to the last."""
-        return _spread(np.arange(self.times.size), count)
-
-
-@dataclass(frozen=True)
-class Pair:
+class Pair(NamedTuple):
     """One quantity of model and truth at one time."""
 
-    time: float
     model: np.ndarray
     truth: np.ndarray
-
-
-@dataclass(frozen=True)
-class Plane:
-    """Velocity (3, n, n) and vorticity magnitude (n, n) in the plane z = pi, reconstructed from particles.
-
-    The velocity is relative to the mean over the particles. The last two axes are y, x.
-    """
-
-    velocity: np.ndarray
-    vorticity: np.ndarray
-
-
-@dataclass(frozen=True)
-class SpectraAt:
-    """Energy spectra (shells,) at one time, k = 0, 1, ...
-
-    `model` and `truth` come from the velocities of the particles. `filtered` is the spectrum of the filtered flow.
-    """
-
-    time: float
-    model: np.ndarray
-    truth: np.ndarray
-    filtered: np.ndarray
-
-    @property
-    def wavenumber(self) -> np.ndarray:
-        return np.arange(len(self.model))
-
-    def error(self, of: str, filter_wavenumber: float) -> float:
-        """Return the `spectrum_error` of a spectrum relative to the filtered flow, up to `filter_wavenumber`.
-
-        `of` names the spectrum: "model" or "truth".
-        """
-        return spectrum_error(getattr(self, of), self.filtered, filter_wavenumber)
-
-    def bands(self, of: str, filter_wavenumber: float) -> dict[str, float]:
-        """Return the `band_ratios` of a spectrum to that of the filtered flow, up to `filter_wavenumber`.
-
-        `of` names the spectrum: "model" or "truth".
-        """
-        return band_ratios(getattr(self, of), self.filtered, filter_wavenumber)
 
 
 @dataclass(frozen=True)
@@ -129,7 +69,9 @@ class Rollout:
         of modes to the velocities of the particles.
     invariants : for "model" and "truth", the invariants of the velocity gradients at the particles, by frame number.
         None without a kernel, because the kernel reconstructs the gradients.
-    planes : for "model" and "truth", a plane of the reconstructed field, by frame number. None without a kernel.
+    planes : for "model" and "truth", velocity (3, n, n) and vorticity magnitude (n, n) of the reconstructed field in
+        the plane z = pi, by frame number. The velocity is relative to the mean over the particles. The last two axes
+        are y, x. None without a kernel.
     outside_training : share of the particle pairs for which an input of a network is outside its range in training,
         (frames,); None if it was not counted.
     closure : columns (frames,) `solves`, `iterations`, `most_iterations`, `residual` and `not_converged` of the
@@ -144,7 +86,7 @@ class Rollout:
     reference: Mapping[str, float]
     spectra: Mapping[str, Mapping[int, np.ndarray]]
     invariants: Mapping[str, Mapping[int, Invariants]] | None
-    planes: Mapping[str, Mapping[int, Plane]] | None = None
+    planes: Mapping[str, Mapping[int, tuple[np.ndarray, np.ndarray]]] | None = None
     outside_training: np.ndarray | None = None
     closure: Table | None = None
     without_truth: str = ""
@@ -200,10 +142,15 @@ class Rollout:
 
     @cached_property
     def common(self) -> CommonFrames:
-        """The common frames before the time `broken`. Raises ValueError, with the reason, if there are none."""
+        """The frames of both before the time `broken` that have the `same_times`. Raises ValueError, with the reason,
+        if there are none."""
         if not len(self.truth.times) and self.without_truth:
             raise ValueError(self.without_truth)
-        return CommonFrames.of(self.model, self.truth, self.broken)
+        model, truth = same_times(self.model.times, self.truth.times)
+        early = self.model.times[model] < self.broken
+        if not early.any():
+            raise ValueError("there is no time at which model and truth both have finite values")
+        return CommonFrames(model[early], truth[early], self.model.times[model[early]])
 
     def before_broken(self, of: str) -> np.ndarray:
         """Return the frame numbers before the time `broken`. `of` is "model" or "truth"."""
@@ -211,9 +158,8 @@ class Rollout:
 
     def pair(self, index: int, column: str) -> Pair:
         """Return a column of model and truth at the common frame `index`. Rows are particles in order of id."""
-        common = self.common
-        return Pair(float(common.times[index]), self.model.read(int(common.model[index]), column),
-                    self.truth.read(int(common.truth[index]), column))
+        return Pair(self.model.read(int(self.common.model[index]), column),
+                    self.truth.read(int(self.common.truth[index]), column))
 
     def both(self, measures: Mapping[str, Mapping[int, Any]], index: int) -> tuple[Any, Any]:
         """Return the values of model and truth at the common frame `index`; `measures` is, for example, `spectra`."""
@@ -229,12 +175,9 @@ class Rollout:
         """Return the indices of the common frames at whose times the spectrum of the flow is stored."""
         return np.flatnonzero(self._has_flow(self.common.times))
 
-    def shown_spectra(self, several: bool = True) -> np.ndarray:
-        """Return at most SHOWN of the indices that `spectral` returns, evenly spread.
-
-        If `several` is false, return only the last one.
-        """
-        return _spread(self.spectral(), SHOWN) if several else self.spectral()[-1:]
+    def shown_spectra(self) -> np.ndarray:
+        """Return at most SHOWN of the indices that `spectral` returns, evenly spread."""
+        return spread(self.spectral(), SHOWN)
 
     def late_spectra(self) -> np.ndarray:
         """Return the frame numbers over which the spectrum of the model is averaged.
@@ -248,17 +191,19 @@ class Rollout:
         frames = np.flatnonzero(chosen & (times < self.broken))
         return frames[second_half(times[frames], float(times[self.before_broken("model")[-1]]))]
 
-    def spectra_at(self, index: int) -> SpectraAt:
-        """Return the spectra at the common frame `index`, in the shells that all three spectra have.
+    def spectra_at(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the energy spectra (shells,) of model, truth and filtered flow at the common frame `index`, in the
+        shells that all three have.
 
         The spectrum of the filtered flow is the one at the nearest stored time.
         """
-        common = self.common
         model, truth = self.both(self.spectra, index)
-        nearest = int(np.argmin(np.abs(self.flow["time"] - (self.start_time + common.times[index]))))
         shells = min(len(model), self.flow["wavenumber"].size)
-        return SpectraAt(float(common.times[index]), model[:shells], truth[:shells],
-                         self.flow["filtered"][nearest][:shells])
+        return model[:shells], truth[:shells], self.flow["filtered"][self.flow_row(index)][:shells]
+
+    def flow_row(self, index: int) -> int:
+        """Return the row of the table `flow` whose time is the nearest to that of the common frame `index`."""
+        return int(np.argmin(np.abs(self.flow["time"] - (self.start_time + self.common.times[index]))))
 
     def _has_flow(self, times: np.ndarray) -> np.ndarray:
         return _contained(self.start_time + times, self.flow["time"])
@@ -273,7 +218,7 @@ def second_half(times: np.ndarray, end: float) -> np.ndarray:
     return rows if rows.size else np.array([max(int(np.searchsorted(times, end, "right")) - 1, 0)])
 
 
-def _spread(values: np.ndarray, count: int) -> np.ndarray:
+def spread(values: np.ndarray, count: int) -> np.ndarray:
     """Return at most `count` of the values (m,), evenly spread from the first to the last."""
     return values[np.unique(np.rint(np.linspace(0, len(values) - 1, count)).astype(int))]
 

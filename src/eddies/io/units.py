@@ -18,6 +18,7 @@ ORIGINS = {
                     "at time released_at (attribute of reference) of the simulation; for `statistics`, `stationary` "
                     "and fields/final: the start of the simulation",
     "reconstruction": "the first frame of the tracks",
+    "measures": "the start of the rollout, start_time after the release of the tracers",
     "rollout": "the start of the rollout, start_time (attribute of rollout) after the release of the tracers",
 }
 

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import functools
 import io
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 from matplotlib.transforms import Bbox
 
-from eddies.analysis.pdfs import bin_centres, gaussian, pdf, standardized
+Look = tuple[str, str]  # colour, marker
+Table = Mapping[str, np.ndarray]
 
 # The palette of Okabe and Ito, which colour-blind readers can distinguish. A quantity has one colour in all figures.
-DNS, FILTERED, TRUTH, MODEL = "#000000", "#7f7f7f", "#0072B2", "#D55E00"
-SECOND, THIRD, FOURTH = "#009E73", "#CC79A7", "#E69F00"
+DNS, FILTERED, TRUTH, MODEL = "#000000", "#7f7f7f", "#000000", "#D55E00"
+BLUE, SECOND, THIRD, FOURTH, FIFTH, SIXTH = "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8c564b"
 GUIDE, NOTE = "#9a9a9a", "#5a5a5a"
 SIGNED, POSITIVE = "RdBu_r", "viridis"
 LEFT, RIGHT, BOTTOM, TOP = 0.84, 0.12, 0.5, 0.3  # inches around a panel, for its labels and its title
@@ -33,10 +38,33 @@ STYLE = {
     "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.8, "lines.linewidth": 1.7,
     "axes.formatter.limits": (-4, 4),  # wider tick labels get a common factor
     "legend.frameon": False, "figure.dpi": 150, "savefig.dpi": 150, "axes.prop_cycle": matplotlib.cycler(
-        color=[TRUTH, MODEL, SECOND, THIRD, FOURTH, DNS]),
+        color=[BLUE, MODEL, SECOND, THIRD, FOURTH, DNS]),
 }
+# Colour and marker of each method in all figures, by the name of its preset; "none": without any force.
+LOOKS = {"paper": (MODEL, "o"), "resolved": (SECOND, "s"), "local": (THIRD, "D"), "paper-code": (SIXTH, "v"),
+         "wcsph": (FOURTH, "^"), "transport-velocity": (FIFTH, "P"), "none": ("#b5a642", "X")}
+OTHERS = list(zip(("#7b3294", "#e7298a", "#66a61e", "#a6761d", "#1b9e77", "#666633"), ">p<d*8"))  # of other methods
+GRID, LIGHTEST = "h", 0.55  # marker of grids; share of white in the blue of the coarsest grid
+WIDE = {"color": TRUTH, "linewidth": 2.2}  # a line of the truth, which is seen beside and behind other lines
+ACROSS = 5  # entries in a line of a legend at the foot of a figure
 # The backend is left out: rc_context does not restore it, and a notebook would no longer show its figures.
 PLAIN = {key: value for key, value in matplotlib.rcParamsDefault.items() if key != "backend"}
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A variant in figures: its label, its colour and marker, and numbers and tables of it."""
+
+    label: str
+    look: Look
+    numbers: Mapping[str, Any]
+    tables: Mapping[str, Table]
+
+    def line(self, table: Table) -> dict[str, Any]:
+        """Return the style of a line through columns of a table, with about eight markers."""
+        points = max(np.shape(column)[-1] for column in table.values())
+        return {"color": self.look[0], "marker": self.look[1], "markersize": 4, "markevery": max(points // 8, 1),
+                "label": self.label}
 
 
 def styled(draw: Callable) -> Callable:
@@ -49,24 +77,23 @@ def styled(draw: Callable) -> Callable:
 
 
 def panels(rows: int, columns: int, size: tuple[float, float], right: float = 0.0, below: float = 0.0,
-           foot: float = 0.0, **sharing) -> tuple[Figure, np.ndarray]:
+           **sharing) -> tuple[Figure, np.ndarray]:
     """Return a figure and its axes (rows, columns), with fixed margins for labels and titles.
 
     All lengths are in inches. size: width and height of a panel with its labels. right: room for colour bars, beside
-    each panel or, with `sharey`, beside the last one. below: room for a legend below each panel. foot: room for a
-    legend below all panels. sharing: `sharex` and `sharey` of `Figure.subplots`.
+    each panel or, with `sharey`, beside the last one. below: room for a legend below each panel. sharing: `sharex` and
+    `sharey` of `Figure.subplots`.
     """
     width, height = size[0] * columns, size[1] * rows
-    figure = Figure(figsize=(width, height + foot))
+    figure = Figure(figsize=(width, height))
     across, up = RIGHT + right + LEFT, TOP + below + BOTTOM
     if sharing.get("sharey"):
         across = RIGHT + 0.08
     if sharing.get("sharex") is True:
         up = TOP + 0.05
-    left, upper, end, lower = LEFT, height + foot - TOP, width - RIGHT - right, foot + below + BOTTOM
+    left, upper, end, lower = LEFT, height - TOP, width - RIGHT - right, below + BOTTOM
     wide, high = (end - left - (columns - 1) * across) / columns, (upper - lower - (rows - 1) * up) / rows
-    figure.subplots_adjust(left / width, lower / (height + foot), end / width, upper / (height + foot), across / wide,
-                           up / high)
+    figure.subplots_adjust(left / width, lower / height, end / width, upper / height, across / wide, up / high)
     axes = figure.subplots(rows, columns, squeeze=False, **sharing)
     for panel in axes.flat:
         # The factor of the tick labels is written to the left of the title.
@@ -74,9 +101,14 @@ def panels(rows: int, columns: int, size: tuple[float, float], right: float = 0.
     return figure, axes
 
 
-def legend_at_foot(figure: Figure, axis: Axes, columns: int) -> None:
-    """Put the legend of a panel at the foot of the figure, where the argument `foot` of `panels` has left room."""
-    figure.legend(*axis.get_legend_handles_labels(), loc="lower center", ncols=columns)
+def legend_at_foot(figure: Figure, handles: Sequence[Any] | Axes) -> None:
+    """Put a legend below all panels, for which the figure becomes higher. Its entries are lines or those of a panel."""
+    handles = handles.get_legend_handles_labels()[0] if isinstance(handles, Axes) else handles
+    foot, (width, height), place = 0.1 + 0.2 * -(-len(handles) // ACROSS), figure.get_size_inches(), figure.subplotpars
+    figure.set_size_inches(width, height + foot)
+    figure.subplots_adjust(bottom=(place.bottom * height + foot) / (height + foot),
+                           top=(place.top * height + foot) / (height + foot))
+    figure.legend(handles=handles, loc="lower center", ncols=min(len(handles), ACROSS), columnspacing=1.2)
 
 
 def letter(axes: Sequence[Axes]) -> None:
@@ -122,20 +154,22 @@ def largest(*arrays: np.ndarray) -> float:
     return float(np.quantile(values, 0.998)) or 1.0
 
 
-def draw_pdfs(axis: Axes, truth: np.ndarray, model: np.ndarray, edges: np.ndarray) -> None:
-    """Draw the PDFs of true and modelled values, and a Gaussian.
+def looks(methods: Mapping[str, Sequence[str]], cells: Mapping[str, int]) -> dict[str, Look]:
+    """Return the colour and the marker of each variant.
 
-    Values are standardised with the mean and the standard deviation of the truth. `edges` are the edges of the bins for
-    these standardised values.
+    methods: for each variant, by its name, the names in LOOKS that suit it; the first one that no earlier variant has
+    is taken. cells: for variants on a grid, the number of cells along its edge; the fewer, the lighter the colour.
     """
-    centres = bin_centres(edges)
-    densities = (pdf(standardized(values, truth), edges) for values in (truth, model))
-    true, modelled = (np.where(density > 0, density, np.nan) for density in densities)
-    axis.semilogy(centres, gaussian(centres), color=GUIDE, linestyle=":", label="Gaussian")
-    axis.semilogy(centres, true, color=TRUTH, label="truth")
-    axis.semilogy(centres, modelled, color=MODEL, linestyle="none", marker="o", markersize=3.3,
-                  markerfacecolor="none", label="model")
-    axis.set_ylim(0.4 / truth.size / (edges[1] - edges[0]), 2)
+    found: dict[str, Look] = {}
+    free, sizes = iter(itertools.cycle(OTHERS)), sorted(set(cells.values()))
+    for name, suiting in methods.items():
+        if name in cells:
+            white = LIGHTEST * (1 - sizes.index(cells[name]) / (len(sizes) - 1)) if len(sizes) > 1 else 0.0
+            found[name] = to_hex((1 - white) * np.array(to_rgb(BLUE)) + white), GRID
+        else:
+            known = (LOOKS[key] for key in suiting if key in LOOKS and LOOKS[key] not in found.values())
+            found[name] = next(known, None) or next(free)
+    return found
 
 
 def show_plane(axis: Axes, plane: np.ndarray, limits: tuple[float, float], colours: str):
@@ -200,6 +234,12 @@ def legend_below(axis: Axes, columns: int) -> None:
     """Put the legend below the panel, where it hides no line."""
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=3.8, ncol=columns, columnspacing=1.2,
                 handlelength=1.8)
+
+
+def mark_cutoff(axis: Axes, cutoff: float) -> None:
+    """Draw a vertical line at the filter wavenumber."""
+    axis.axvline(cutoff, color=GUIDE, linestyle=":", linewidth=1)
+    note(axis, r"$\pi/d$", (cutoff, 0.01), ("data", "axes fraction"), (3, 1))
 
 
 def mark_time(axis: Axes, time: float, label: str) -> None:

@@ -5,32 +5,30 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from eddies.report.figures import (BAR, DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SECOND, SIGNED, TRUTH,
-                                   colour_bar, guide_power_law, largest, legend_below, letter, mark_time, note,
-                                   number_wavenumbers, panels, show_plane, styled)
-from eddies.report.page import Metric, Section
-
-Table = Mapping[str, np.ndarray]
+from eddies.report.figures import (BAR, BLUE, DNS, FILTERED, FOURTH, MODEL, POSITIVE, SECOND, SIGNED,
+                                   Table, colour_bar, guide_power_law, largest, legend_below, letter, mark_cutoff,
+                                   mark_time, number_wavenumbers, panels, show_plane, styled)
+from eddies.report.page import Section
 
 # Panels of the history: title, axis label, and the columns with their labels, colours and line styles.
 HISTORY = (
     ("Kinetic energy", r"$\frac{1}{2}\langle u\cdot u\rangle$", (("energy", None, DNS, "-"),)),
     ("Dissipation", "energy rate", (
-        ("dissipation_rate", "dissipation", TRUTH, "-"),
+        ("dissipation_rate", "dissipation", BLUE, "-"),
         ("injection_rate", "injection", FOURTH, "--"))),
     ("Taylor Reynolds number", r"$Re_\lambda$", (("reynolds_lambda", None, DNS, "-"),)),
     ("Resolution", r"$k_{\max}\,\eta$", (("kmax_eta", None, DNS, "-"),)),
     ("Compressibility", "fraction", (
-        ("mach_turbulent", r"$M_t$", TRUTH, "-"),
+        ("mach_turbulent", r"$M_t$", BLUE, "-"),
         ("density_rms", r"$\rho_{rms}/\rho_0$", MODEL, "--"),
         ("compressible_fraction", "energy", SECOND, "-."))),
     ("Longitudinal gradient", "moment", (
-        ("skewness", "skewness", TRUTH, "-"),
+        ("skewness", "skewness", BLUE, "-"),
         ("flatness", "flatness", MODEL, "--"))),
 )
 # The panel with a logarithmic axis, and the smallest value in it: smaller ones are only rounding errors.
 LOGARITHMIC, SMALLEST = "Compressibility", 1e-8
-METRICS = {
+LABELS = {
     "reynolds_lambda": "Taylor Reynolds number Re_λ", "kmax_eta": "resolution k_max η",
     "mach_turbulent": "turbulent Mach number M_t",
     "energy_budget_error": "relative error of the energy budget",
@@ -40,6 +38,8 @@ METRICS = {
     "density_rms": "density rms", "filter_width": "filter width d", "spacing": "mean particle spacing",
     "velocity_rms": "velocity rms of the tracers", "acceleration_rms": "acceleration rms of the tracers",
 }
+REASONS = {"mach_turbulent": "an incompressible fluid has none",
+           "kmax_eta": "nothing is dissipated, so there is no smallest scale to resolve"}
 
 
 def section(statistics: Table, spectra: Table, reference: Mapping[str, float], planes: Table,
@@ -61,16 +61,12 @@ def section(statistics: Table, spectra: Table, reference: Mapping[str, float], p
     at = {name: float(values[row]) for name, values in statistics.items()} | dict(reference)
     if eta == 0:
         at["kmax_eta"] = None
-    reasons = {"mach_turbulent": "an incompressible fluid has none",
-               "kmax_eta": "nothing is dissipated, so there is no smallest scale to resolve"}
     when = "at the end" if released is None else "at the release of the tracers"
     shown = Section(
         "ground_truth", "Ground truth", f"{source} Numbers {when}, t = {at['time']:.3g}.",
-        metrics=[Metric(key, label, at.get(key), reasons.get(key, ""))
-                 for key, label in METRICS.items() if key in at or key == "mach_turbulent"],
-        main=("reynolds_lambda", "kmax_eta", "mach_turbulent"))
+        {key: at.get(key) for key in LABELS if key in at or key == "mach_turbulent"}, LABELS, REASONS)
     shown.add_figure(
-        "statistics", "History of the simulation", statistics_history(statistics, released),
+        "statistics", "History of the simulation", lambda: statistics_history(statistics, released),
         f"From t = {times[0]:.3g} to {times[-1]:.3g}. Energy {when}: {at['energy']:.3g}; dissipation rate: "
         f"{at['dissipation_rate']:.3g}.")
     frame = -1 if released is None else int(np.argmin(np.abs(spectra["time"])))
@@ -81,8 +77,8 @@ def section(statistics: Table, spectra: Table, reference: Mapping[str, float], p
         caption += (f" The filter of width d = {width:.3g} keeps {filtered.sum() / energy.sum():.1%} of the energy. "
                     "Dotted: its wavenumber k_d = π/d.")
     shown.add_figure("spectra", "Energy spectrum of the ground truth",
-                     energy_spectra(spectra["wavenumber"], energy, filtered, width), caption)
-    shown.add_figure("fields", "Velocity and vorticity", field_planes(**planes),
+                     lambda: energy_spectra(spectra["wavenumber"], energy, filtered, width), caption)
+    shown.add_figure("fields", "Velocity and vorticity", lambda: field_planes(**planes),
                      f"Plane z = π of the last stored {field_name} field.")
     return shown
 
@@ -130,8 +126,7 @@ def energy_spectra(wavenumber: np.ndarray, energy: np.ndarray, filtered: np.ndar
     axis.loglog(k, spectrum, color=DNS, label="DNS", marker="o" if k.size < 8 else None)
     if filtered is not None:
         axis.loglog(k, filtered[inside], color=FILTERED, linestyle="--", label="filtered DNS")
-        axis.axvline(np.pi / filter_width, color=GUIDE, linestyle=":", linewidth=1)
-        note(axis, "$k_d$", (np.pi / filter_width, 0.02), ("data", "axes fraction"), (3, 2))
+        mark_cutoff(axis, np.pi / filter_width)
     guide = k[(k >= 2) & (k <= max(6, k.max() / 4))]
     if guide.size > 2:
         guide_power_law(axis, guide, 1.6 * spectrum[k == guide[0]][0], -5 / 3, r"$k^{-5/3}$")

@@ -7,20 +7,14 @@ from matplotlib.figure import Figure
 
 from eddies.report.figures import (BAR, DNS, MODEL, SECOND, SIGNED, THIRD, colour_bar, largest, letter, panels,
                                    show_plane, styled)
-from eddies.report.page import Metric, Section
+from eddies.report.page import Section
 
-KERNELS = {  # name in the files: label, colour, line style
-    "learned": ("learned", MODEL, "-"),
-    "learned_no_gradient": (r"learned without $L_g$", THIRD, "--"),
-    "cubic_spline": ("cubic spline", DNS, "-."),
-    "wendland": ("Wendland C$^2$", SECOND, ":"),
-}
-ERRORS = {  # name of a reconstruction in the files: start of its keys in the report, name in words
-    "learned": ("", "learned kernel"),
-    "learned_no_gradient": ("no_gradient_", "learned without L_g"),
-    "cubic_spline": ("cubic_spline_", "cubic spline"),
-    "wendland": ("wendland_", "Wendland C²"),
-    "kriging": ("kriging_", "kriging, without a kernel"),
+KERNELS = {  # name in the files: start of its keys in the report, name in words, label, colour, line style
+    "learned": ("", "learned kernel", "learned", MODEL, "-"),
+    "learned_no_gradient": ("no_gradient_", "learned without L_g", r"learned without $L_g$", THIRD, "--"),
+    "cubic_spline": ("cubic_spline_", "cubic spline", "cubic spline", DNS, "-."),
+    "wendland": ("wendland_", "Wendland C²", "Wendland C$^2$", SECOND, ":"),
+    "kriging": ("kriging_", "kriging, without a kernel", "kriging", DNS, "-"),
 }
 
 
@@ -33,7 +27,7 @@ def shapes(kernels: Mapping[str, np.ndarray]) -> Figure:
     figure, axes = panels(1, 2, (4.4, 3.3))
     for axis, kind in zip(axes.flat, ("value", "derivative")):
         axis.axhline(0, color="#cccccc", linewidth=0.8)
-        for name, (label, colour, style) in KERNELS.items():
+        for name, (*_, label, colour, style) in KERNELS.items():
             if f"{kind}_{name}" in kernels:
                 axis.plot(kernels["r_over_h"], kernels[f"{kind}_{name}"], color=colour, linestyle=style,
                           label=label)
@@ -63,7 +57,7 @@ def reconstructed_planes(slices: Mapping[str, np.ndarray], errors: Mapping[str, 
         row[0].set(title="filtered DNS", ylabel="$y$")
         for axis, name in zip(row[1:], names):
             show_plane(axis, slices[f"{quantity}_{name}"], (-limit, limit), SIGNED)
-            axis.set_title(f"{KERNELS[name][0]}: {float(errors[f'{quantity}_error_{name}']):.3f}")
+            axis.set_title(f"{KERNELS[name][2]}: {float(errors[f'{quantity}_error_{name}']):.3f}")
         colour_bar(figure, image, row, symbol)
     for axis in axes[-1]:
         axis.set_xlabel("$x$")
@@ -78,22 +72,22 @@ def section(support: float, kernels: Mapping[str, np.ndarray], slices: Mapping[s
     support: support radius of the kernels. kernels, slices, errors: the tables with these names in kernel.h5. Errors
     are those on a field that the training has not used.
     """
-    def error(key: str, label: str, column: str) -> Metric:
-        return Metric(key, label, float(errors[column]) if column in errors else None, "this kernel was not compared")
-
-    metrics = [Metric("support", "support radius h", float(support)),
-               error("integral", "integral of the learned kernel", "integral_learned")]
-    metrics += [error(f"{start}{field}_error", f"error of the {field} field, {words}", f"{field}_error_{name}")
-                for name, (start, words) in ERRORS.items() for field in ("velocity", "gradient")]
+    numbers, labels = {"support": float(support), "integral": float(errors["integral_learned"])}, {
+        "support": "support radius h", "integral": "integral of the learned kernel"}
+    for name, (start, words, *_) in KERNELS.items():
+        for field in ("velocity", "gradient"):
+            labels[f"{start}{field}_error"] = f"error of the {field} field, {words}"
+            column = f"{field}_error_{name}"
+            numbers[f"{start}{field}_error"] = float(errors[column]) if column in errors else None
     shown = Section("kernel", "Smoothing kernel", "Fields reconstructed from particles by each kernel, compared with "
-                    "the filtered field. Errors are normalised L2 errors over a whole unseen field.",
-                    metrics=metrics, main=("velocity_error", "gradient_error"))
+                    "the filtered field. Errors are normalised L2 errors over a whole unseen field.", numbers, labels,
+                    dict.fromkeys(numbers, "this kernel was not compared"))
     shown.add_figure(
-        "figure-1-kernels", "Kernels and their derivatives (the paper's Fig. 1)", shapes(kernels),
+        "figure-1-kernels", "Kernels and their derivatives (the paper's Fig. 1)", lambda: shapes(kernels),
         f"Support h = {support:.3g}. The integral of the learned kernel is {errors['integral_learned']:.6f}.")
     shown.add_figure(
         "figure-2-reconstruction", "Fields reconstructed from particles (the paper's Fig. 2)",
-        reconstructed_planes(slices, errors),
+        lambda: reconstructed_planes(slices, errors),
         "Plane z = π of an unseen frame. Numbers in titles: normalised error over the whole field. Learned kernel: "
         f"velocity {errors['velocity_error_learned']:.3f}, gradient {errors['gradient_error_learned']:.3f}.")
     return shown

@@ -7,12 +7,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from eddies.clock import duration
-from eddies.report.figures import (DNS, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, legend_at_foot, letter, panels,
+from eddies.report.figures import (BLUE, DNS, FOURTH, GUIDE, MODEL, SECOND, THIRD, legend_at_foot, letter, panels,
                                    styled)
 
 LOSSES = (
     ("loss", "total", DNS), ("trajectory_loss", "trajectory $L_t$", MODEL),
-    ("field_loss", "field $L_f$", TRUTH), ("velocity_kl_loss", "velocity KL", SECOND),
+    ("field_loss", "field $L_f$", BLUE), ("velocity_kl_loss", "velocity KL", SECOND),
     ("acceleration_kl_loss", "acceleration KL", FOURTH), ("rollout_loss", "velocity over the horizon", THIRD),
     ("density_loss", "density over the horizon", "#e377c2"),
     ("energy_loss", "energy over the horizon", "#56B4E9"), ("power_loss", "power", "#8c564b"),
@@ -21,27 +21,36 @@ SMOOTHED = 0.04  # share of the steps of a phase over which a noisy curve is ave
 
 
 @styled
-def curves(history: Mapping[str, np.ndarray]) -> Figure:
-    """Draw losses and validation errors over the steps of a training. All phases are equally wide.
+def curves(histories: Mapping[str, tuple[Mapping[str, np.ndarray], str]]) -> Figure:
+    """Draw losses and validation errors over the steps of trainings, which are given with their colours by label. All
+    phases are equally wide.
 
-    history: columns (steps,). A loss that is not used in a step is NaN; a loss that is never used has no column.
+    A history has columns (steps,). A loss that is not used in a step is NaN; a loss that is never used has no column.
+    One training has all its losses, each in a colour. Several have their total losses.
     """
-    # Steps of the first phase are drawn in (0, 1], those of the second in (1, 2], and so on.
+    alone, x = len(histories) == 1, "phases of the training"
+    figure, ((losses, errors),) = panels(1, 2, (5.3, 3.2), below=0.15 * alone)
+    for label, (history, colour) in histories.items():
+        history = _placed(history)
+        for name, words, own in LOSSES if alone else (("loss", label, colour),):
+            if name in history and np.any(history[name] > 0):
+                _noisy(losses, history, name, own, words)
+        _validation(errors, history, colour)
+    losses.set(title="Losses", ylabel="loss" if alone else "total loss", yscale="log", xlabel=x)
+    errors.set(title="Validation error, minima circled", ylabel="validation error", ylim=(0, None), xlabel=x)
+    for axis in (losses, errors) if alone else ():
+        _mark_phases(axis, history)
+    legend_at_foot(figure, losses)
+    letter((losses, errors))
+    return figure
+
+
+def _placed(history: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return a history with a column `place`. Steps of the first phase have places in (0, 1], those of the second in
+    (1, 2], and so on."""
     _, index, count = np.unique(history["phase"], return_inverse=True, return_counts=True)
     before = np.cumsum(count) - count
-    history = {**history, "place": index + (np.arange(len(index)) - before[index] + 1) / count[index]}
-    figure, axes = panels(1, 2, (5.3, 3.2), below=0.15, foot=0.5)
-    losses, errors = axes[0]
-    for name, label, colour in LOSSES:
-        if name in history and np.any(history[name] > 0):
-            _noisy(losses, history, name, colour, label)
-    losses.set(title="Losses", ylabel="loss", yscale="log")
-    _validation(errors, history)
-    for axis in axes.flat:
-        _mark_phases(axis, history)
-    legend_at_foot(figure, losses, 4)
-    letter(axes.flat)
-    return figure
+    return {**history, "place": index + (np.arange(len(index)) - before[index] + 1) / count[index]}
 
 
 def _mark_phases(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
@@ -56,14 +65,13 @@ def _mark_phases(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
     axis.set_xlabel("steps and wall time")
 
 
-def _validation(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
+def _validation(axis: Axes, history: Mapping[str, np.ndarray], colour: str) -> None:
     """Draw a line of validation errors for each phase, and a circle at the minimum of each line.
 
     Phases have separate lines because they measure errors in different ways. A line begins with the error before the
     first step of the phase.
     """
-    axis.set(title="Validation error, minima circled", ylabel="validation error")
-    missing, highest = np.full(len(history["step"]), np.nan), 0.0
+    missing = np.full(len(history["step"]), np.nan)
     after, before = (history.get(name, missing) for name in ("validation_error", "start_error"))
     for index, number in enumerate(np.unique(history["phase"])):
         chosen = history["phase"] == number
@@ -71,11 +79,8 @@ def _validation(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
         error = np.append(before[chosen][0], after[chosen])
         place, error = place[np.isfinite(error)], error[np.isfinite(error)]
         if len(error):
-            best, highest = np.argmin(error), max(highest, error.max())
-            axis.plot(place, error, color=MODEL, marker="o", markersize=3)
-            axis.plot(place[best], error[best], marker="o", markersize=8, markerfacecolor="none", color=DNS)
-    if highest > 0:
-        axis.set_ylim(0, 1.1 * highest)
+            axis.plot(place, error, color=colour, marker="o", markersize=3)
+            axis.plot(place[np.argmin(error)], error.min(), marker="o", markersize=8, markerfacecolor="none", color=DNS)
 
 
 def _noisy(axis: Axes, history: Mapping[str, np.ndarray], name: str, colour: str, label: str) -> None:

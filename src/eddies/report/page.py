@@ -1,8 +1,7 @@
-"""The report as one HTML page that needs no other file, and its metrics as JSON."""
+"""The report as one HTML page that needs no other file."""
 
 import base64
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,156 +10,105 @@ import jinja2
 from markupsafe import Markup
 
 from eddies.io.new_files import write_files
-from eddies.measures import finite
-
-Number = float | int | bool | str | dict | None
-#: Keys of the sections in the order of the page, and those of the sections that are not folded.
-ORDER = ("variants", "rollout", "forced", "step", "model", "reconstruction", "kernel", "cost", "ground_truth",
-         "stationary", "tracers")
-OPEN = ("variants", "rollout", "forced")
-
-
-@dataclass(frozen=True)
-class Metric:
-    """One number of the report, or several.
-
-    key: its name in metrics.json. label: its name on the page. value: the number, or several numbers by name; a number
-    that is not finite becomes None. reason: why there is no value. written: the text of the value on the page; empty
-    if it is that of the function `shown`.
-    """
-
-    key: str
-    label: str
-    value: Number
-    reason: str = ""
-    written: str = ""
-
-    def __post_init__(self):
-        if isinstance(self.value, dict):
-            object.__setattr__(self, "value", {name: finite(value) for name, value in self.value.items()})
-        elif finite(self.value) is None:
-            missing = "not measured in this run" if self.value is None else "not a finite number"
-            object.__setattr__(self, "value", None)
-            object.__setattr__(self, "reason", self.reason or missing)
+from eddies.measures import MEASURES, finite
 
 
 @dataclass
 class Illustration:
     """A figure of the page, with its title and its caption.
 
-    name: name of its file without the ending. figure: a matplotlib figure. png: the figure as a PNG image; empty until
-    it is drawn.
+    name: name of its file without the ending. make: makes the matplotlib figure. png: the figure as a PNG image; empty
+    until it is drawn.
     """
 
     name: str
     title: str
-    figure: Any
+    make: Callable[[], Any]
     caption: str
     png: bytes = b""
 
 
 @dataclass
 class Section:
-    """A section of the page. Its metrics are in metrics.json under the key `key`.
+    """A section of the page.
 
-    notices: sentences in coloured boxes. main: keys of the metrics that are shown beside the title. folded: whether
-    the section shows only its title and its main metrics until it is opened.
+    text: sentences at its beginning. numbers: its numbers by key, for metrics.json. labels: words for keys in the
+    table. reasons: why a number has no value, by key. columns: the values in the table by title of the column and by
+    key; by default those of `numbers`. notices: sentences in coloured boxes.
     """
 
     key: str
     title: str
     text: str = ""
-    notices: list[str] = field(default_factory=list)
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+    labels: Mapping[str, str] = field(default_factory=dict)
+    reasons: Mapping[str, str] = field(default_factory=dict)
+    columns: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    notices: Sequence[str] = ()
     illustrations: list[Illustration] = field(default_factory=list)
-    metrics: list[Metric] = field(default_factory=list)
-    main: Sequence[str] = ()
-    folded: bool = False
 
-    def add_figure(self, name: str, title: str, figure: Any, caption: str) -> None:
-        """Append a matplotlib figure."""
-        self.illustrations.append(Illustration(name, title, figure, caption))
+    def add_figure(self, name: str, title: str, make: Callable[[], Any], caption: str) -> None:
+        """Append a figure. `make` makes it."""
+        self.illustrations.append(Illustration(name, title, make, caption))
 
     @property
-    def tiles(self) -> list[Metric]:
-        """The main metrics that have a value."""
-        return [metric for metric in self.metrics if metric.key in self.main and metric.value is not None]
+    def table(self) -> list[list[str]]:
+        """The rows of the table. The first one holds the titles of the columns. A key without a label is its own."""
+        columns = self.columns or {"": self.numbers}
+        keys = dict.fromkeys(key for values in columns.values() for key in values)
+        return [["", *columns], *([self.labels.get(key) or MEASURES.get(key) or key.replace("_", " "),
+                                   *(self._cell(key, values) for values in columns.values())] for key in keys)]
 
-    @property
-    def columns(self) -> list[str]:
-        """Names of the columns of the section's table if all metrics hold several values; otherwise empty."""
-        if not all(isinstance(metric.value, dict) for metric in self.metrics):
-            return []
-        return list(dict.fromkeys(name for metric in self.metrics for name in metric.value))
-
-
-@dataclass(frozen=True)
-class RunRecord:
-    """What the page shows of the run itself, such as its name, its title and the text of its scene.
-
-    products: rows of a table; the first is the header, and each other row is on a product. warnings: sentences on
-    products that do not fit together. links: title and relative path of each page to which this one has a link.
-    """
-
-    name: str
-    title: str
-    scene: str
-    products: Sequence[Sequence[str]]
-    warnings: Sequence[str] = ()
-    links: Sequence[tuple[str, str]] = ()
+    def _cell(self, key: str, values: Mapping[str, Any]) -> str:
+        missing = key in values and finite(values[key]) is None and key in self.reasons
+        return shown(values.get(key, "")) + (f": {self.reasons[key]}" if missing else "")
 
 
-def arranged(sections: Sequence[Section]) -> list[Section]:
-    """Return the sections in the order of the page. Those that are not in OPEN are folded."""
-    ordered = sorted(sections, key=lambda each: ORDER.index(each.key))
-    for each in ordered:
-        each.folded = each.key not in OPEN
-    return ordered
-
-
-def shown(value: Number) -> str:
+def shown(value: Any) -> str:
     """Return a value as text, numbers with four significant digits."""
-    if value is None:
+    if finite(value) is None:
         return "not available"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         return ", ".join(f"{name} {shown(part)}" for name, part in value.items())
-    return str(value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def metrics_json(warnings: Sequence[str], sections: Sequence[Section]) -> str:
-    """Return the warnings and the metrics of each section as strict JSON, in which a missing value is null."""
-    table = {"warnings": list(warnings),
-             **{section.key: {metric.key: metric.value for metric in section.metrics} for section in sections}}
-    return json.dumps(table, indent=2, allow_nan=False) + "\n"
+def strict(value: Any) -> Any:
+    """Return a value for JSON: None for a float that is not finite, also within dicts and lists."""
+    if isinstance(value, Mapping):
+        return {key: strict(part) for key, part in value.items()}
+    return [strict(part) for part in value] if isinstance(value, list | tuple) else finite(value)
 
 
-def write_page(output: Path, run: RunRecord, sections: Sequence[Section], beside: Mapping[str, str]) -> None:
-    """Write index.html, metrics.json, figures/NAME.png and further text files to the directory `output`.
+def write_page(output: Path, sections: Sequence[Section], beside: Mapping[str, str], **run: Any) -> None:
+    """Write index.html, figures/NAME.png and further text files to the directory `output`.
 
-    `beside` maps the names of the further files to their texts. If the directory has an earlier page, its figures that
-    the new page lacks are removed. Raises OSError or WriteError. If a file cannot be written, no existing file is
-    changed.
+    `beside` maps the names of the further files to their texts; `run` is as in `render_page`. If the directory has an
+    earlier page, its figures that the new page lacks are removed. Raises OSError or WriteError. If a file cannot be
+    written, no existing file is changed.
     """
     earlier = (output / "metrics.json").exists()  # other figures are removed only beside an earlier page
     (output / "figures").mkdir(parents=True, exist_ok=True)
     figures = {output / "figures" / f"{each.name}.png": each.png
                for section in sections for each in section.illustrations if each.png}
-    texts = {"index.html": render_page(run, sections), "metrics.json": metrics_json(run.warnings, sections), **beside}
+    texts = {"index.html": render_page(sections, **run), **beside}
     write_files({**figures, **{output / name: text for name, text in texts.items()}})
     for path in (output / "figures").glob("*.png"):
         if earlier and path not in figures:
             path.unlink()
 
 
-def render_page(run: RunRecord, sections: Sequence[Section]) -> str:
-    """Return the page as HTML. Figures that are not drawn yet are left out."""
+def render_page(sections: Sequence[Section], **run: Any) -> str:
+    """Return the page as HTML. Figures that are not drawn yet are left out.
+
+    run: `name`, `title` and `scene`, the text of the scene; `warnings`, sentences on products that do not fit together.
+    """
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    environment.filters |= {"shown": shown, "embedded": _embedded}
+    environment.filters["embedded"] = _embedded
     template = environment.from_string(Path(__file__).with_name("page.html").read_text(encoding="utf-8"))
-    return template.render(run=run, sections=sections)
+    return template.render(sections=sections, **run)
 
 
 def _embedded(image: bytes) -> Markup:

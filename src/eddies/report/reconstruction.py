@@ -5,13 +5,13 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from eddies.report.figures import (BAR, DNS, MODEL, SIGNED, TRUTH, colour_bar, largest, letter, panels, show_plane,
+from eddies.report.figures import (BAR, BLUE, DNS, MODEL, SIGNED, colour_bar, largest, letter, panels, show_plane,
                                    styled)
-from eddies.report.page import Metric, Section
+from eddies.report.page import Section
 
 ERRORS = {  # column of the table: label, colour, line style
     "validation_error": ("velocity at tracks left out", MODEL, "--"),
-    "velocity_error": ("velocity field", TRUTH, "-"),
+    "velocity_error": ("velocity field", BLUE, "-"),
     "gradient_error": ("velocity gradient", DNS, ":")}
 
 
@@ -26,21 +26,19 @@ def section(about: Mapping[str, float | str], errors: Mapping[str, np.ndarray], 
     both = {**{name: (of_fields["time"], of_fields[name]) for name in of_fields if name in ERRORS},
             **{name: (errors["time"], errors[name]) for name in errors if name in ERRORS}}
     both = {name: (time, values) for name, (time, values) in both.items() if np.isfinite(values).any()}
-    means = {name: float(np.nanmean(both[name][1])) if name in both else None for name in ERRORS}
-    metrics = [Metric("reconstruction_method", "method", about["method"]),
-               Metric("particles_of_a_frame", "particles per frame", about["particles"]),
-               *(Metric(name, f"error of the {label}, mean over time (normalised L2)", means[name],
-                        "the true field is not known" if name != "validation_error" else "no track was left out")
-                 for name, (label, _, _) in ERRORS.items()),
-               Metric("seconds_per_frame", "seconds per frame (median)", float(np.median(errors["seconds"])))]
+    numbers = {"reconstruction_method": about["method"], "particles_of_a_frame": about["particles"],
+               **{name: float(np.nanmean(both[name][1])) if name in both else None for name in ERRORS},
+               "seconds_per_frame": float(np.median(errors["seconds"]))}
+    labels = {name: f"error of the {label}, mean over time (normalised L2)" for name, (label, _, _) in ERRORS.items()}
     text = (f"Fields of {len(errors['time'])} frames from the velocities of {about['particles']:.0f} particles, by "
             f"{about['method']}, up to wavenumber {about['highest_wavenumber']}.")
     if about["holdout"]:
         text += (f" A second reconstruction leaves out {about['holdout']:.0%} of the tracks. Its error at these tracks "
                  "estimates the error of the field.")
-    shown = Section("reconstruction", "Reconstruction", text, metrics=metrics,
-                    main=("validation_error", "velocity_error", "gradient_error"))
-    shown.add_figure("reconstruction", "Reconstructed fields", overview(both, plane),
+    shown = Section("reconstruction", "Reconstruction", text, numbers, labels, {
+        name: "the true field is not known" if name != "validation_error" else "no track was left out"
+        for name in ERRORS})
+    shown.add_figure("reconstruction", "Reconstructed fields", lambda: overview(both, plane),
                      "Normalised L2 errors over time" + (", and u_x in the plane z = π of the last frame." if plane
                                                          is not None else "."))
     return shown

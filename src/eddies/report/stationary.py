@@ -8,11 +8,11 @@ from matplotlib.figure import Figure
 
 from eddies.analysis.isotropic_turbulence import (COMPONENTS, INERTIAL, KOLMOGOROV_CONSTANT, Row, StationarySpan,
                                                   comparison)
-from eddies.report.figures import (DNS, FOURTH, GUIDE, MODEL, SECOND, TRUTH, legend_below, letter, number_wavenumbers,
+from eddies.report.figures import (BLUE, DNS, FOURTH, GUIDE, MODEL, SECOND, legend_below, letter, number_wavenumbers,
                                    panels, styled)
-from eddies.report.page import Metric, Section
+from eddies.report.page import Section
 
-HISTORY = (("dissipation_rate", r"dissipation", TRUTH, "-"), ("injection_rate", "injection", FOURTH, "--"))
+HISTORY = (("dissipation_rate", r"dissipation", BLUE, "-"), ("injection_rate", "injection", FOURTH, "--"))
 
 
 @styled
@@ -28,7 +28,7 @@ def stationary_state(statistics: Mapping[str, np.ndarray], span: StationarySpan)
     for column, label, colour, style in HISTORY:
         balance.plot(turnovers, statistics[column], color=colour, linestyle=style, label=label)
     balance.set(title="Energy balance", ylabel="energy, energy rates", ylim=(0, None))
-    for name, colour in zip(COMPONENTS, (TRUTH, MODEL, SECOND)):
+    for name, colour in zip(COMPONENTS, (BLUE, MODEL, SECOND)):
         share = statistics[name] / np.mean([statistics[other] for other in COMPONENTS], axis=0)
         components.plot(turnovers, share, color=colour, label=f"$u_{name[-1]}$")
     components.axhline(1, color=GUIDE, linestyle="--", linewidth=1.1)
@@ -65,15 +65,18 @@ def section(statistics: Mapping[str, np.ndarray], span: StationarySpan) -> Secti
 
     statistics: columns (samples,) of the whole run.
     """
-    first, last = span.columns["time"][[0, -1]]
+    (first, last), rows = span.columns["time"][[0, -1]], comparison(span)
+    numbers = {row.key: columns_of(row) for row in rows}
     shown = Section(
         "stationary", "Stationary turbulence",
         f"Averages over {span.turnovers:.3g} large-eddy turnovers of the forced flow, t = {first:.3g} to {last:.3g}. "
         "Standard errors are those of blocks of a turnover or more, because closer frames are not independent samples. "
         "Deviations are standard deviations in time. Literature: values at this Re_λ.",
-        metrics=[Metric(row.key, row.label, columns_of(row)) for row in comparison(span)])
+        numbers, {row.key: row.label for row in rows}, columns={
+            title: {key: values[title] for key, values in numbers.items() if title in values}
+            for title in dict.fromkeys(title for values in numbers.values() for title in values)})
     shown.add_figure(
-        "stationary", "The stationary state", stationary_state(statistics, span),
+        "stationary", "The stationary state", lambda: stationary_state(statistics, span),
         f"Shaded: the span of the averages. The energy balance closes to {abs(span.energy_imbalance):.1e} of the "
         "dissipation. C: mean spectrum from the mean energy of the modes of each shell. Band: Kolmogorov's constant.")
     return shown

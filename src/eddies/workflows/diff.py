@@ -15,35 +15,57 @@ from eddies.scene.layers import dotted
 from eddies.scene.scene import load_scene
 
 METRICS = Path("report") / "metrics.json"
+OF_VARIANTS = "rollouts", "forced", "models", "steps"  # parts of metrics.json that hold a dict for each variant
 
 
-def run(one: Path, other: Path, comm: Comm) -> None:
-    """Print a line for each setting and each number that differs between two runs; all ranks call it."""
-    lines = in_files(comm, one, lambda: diff_lines(one, other))
+Choice = tuple[Path, str | None]  # a run directory, and the name of a variant
+
+
+def run(one: Choice, other: Choice, comm: Comm) -> None:
+    """Print a line for each setting and each number that differs between two runs or variants; all ranks call it."""
+    lines = in_files(comm, one[0], lambda: diff_lines(one, other))
     if comm.rank == 0:
         sys.stdout.write("".join(f"{line}\n" for line in lines))
 
 
-def diff_lines(one: Path, other: Path) -> list[str]:
+def diff_lines(one: Choice, other: Choice) -> list[str]:
     """Return the lines of two tables of differences: of the settings, defaults included, and of the numbers. The second
     table also has the ratio second / first."""
-    runs = one, other
-    settings = [dict(dotted(tomllib.loads(load_scene(path / "scene.toml").to_toml()))) for path in runs]
-    lines = [*table("setting", settings, runs), ""]
-    if missing := [path for path in runs if not (path / METRICS).is_file()]:
+    both = one, other
+    titles = tuple(str(path if variant is None else path / variant) for path, variant in both)
+    scenes = [load_scene(path / "scene.toml") for path, _ in both]
+    for scene, (_, variant) in zip(scenes, both):
+        scene.check_variants([] if variant is None else [variant])
+    settings = [dict(dotted(tomllib.loads((scene if variant is None else scene.variant[variant]).to_toml())))
+                for scene, (_, variant) in zip(scenes, both)]
+    lines = [*table("setting", settings, titles), ""]
+    if missing := dict.fromkeys(path for path, _ in both if not (path / METRICS).is_file()):
         return [*lines, f"no numbers to compare; run {' and '.join(f'`eddies report {path}`' for path in missing)}"]
-    metrics = [dict(dotted(read_metrics(path / METRICS))) for path in runs]
+    metrics = [dict(dotted(numbers_of(*each))) for each in both]
     numbers = [{key: value for key, value in each.items() if isinstance(value, int | float)} for each in metrics]
-    return [*lines, *table("number", numbers, runs, ratio=True)]
+    return [*lines, *table("number", numbers, titles, ratio=True)]
 
 
-def table(title: str, columns: list[dict[str, Any]], runs: tuple[Path, Path], ratio: bool = False) -> list[str]:
+def numbers_of(path: Path, variant: str | None) -> dict[str, Any]:
+    """Return the numbers of a report. If a variant is given, or if there is only one, its numbers have keys without its
+    name, and those of other variants are left out."""
+    found = read_metrics(path / METRICS)
+    names = dict.fromkeys(name for key in OF_VARIANTS for name in found.get(key, {}))
+    if variant is None and len(names) > 1:
+        return found
+    name = variant or next(iter(names), None)
+    rows = [row for row in found.get("rows", ()) if row["name"] == name]
+    return {**{key: value for key, value in found.items() if key not in (*OF_VARIANTS, "rows")},
+            **{key: found[key].get(name, {}) for key in OF_VARIANTS if key in found}, "row": rows[0] if rows else {}}
+
+
+def table(title: str, columns: list[dict[str, Any]], titles: tuple[str, ...], ratio: bool = False) -> list[str]:
     """Return the lines of a table of the values that differ between two runs, or one line if none differs.
 
-    `title` names the kind of the values, and `columns` holds the values of each run by key. A missing value is shown as
-    "-". If `ratio` is true, a last column has the ratio second / first.
+    `title` names the kind of the values. `columns` holds the values of each run by key, and `titles` names the runs. A
+    missing value is shown as "-". If `ratio` is true, a last column has the ratio second / first.
     """
-    rows = [(title, *map(str, runs), "ratio" if ratio else "")]
+    rows = [(title, *titles, "ratio" if ratio else "")]
     for key in dict.fromkeys([*columns[0], *columns[1]]):
         first, second = (column.get(key) for column in columns)
         if first != second:

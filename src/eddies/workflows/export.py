@@ -73,7 +73,9 @@ def _opened(kind: str, run_directory: Path, alone: Comm) -> Iterator[tuple[Serie
     if kind == "rollout":
         from eddies.workflows.rollout.measured import open_rollout  # needs torch
         with open_rollout(run_directory, alone) as measured:
-            yield measured.exported, measured.provenance
+            particles = measured.particles
+            fields = {name: measured.fields[name] for name in particles} if measured.fields else {}
+            yield {"fields": fields, "particles": particles}, measured.provenance
     else:
         with open_product(alone, run_directory / f"{kind}.h5", kind) as file:
             yield {group: {name: reader(file, name) for name in file.get(group, ())}

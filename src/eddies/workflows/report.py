@@ -1,7 +1,7 @@
-"""The report of a run: pages with the figures of the paper, and a file with the numbers as JSON.
+"""The report of a run: a page with figures, and a file with the numbers as JSON.
 
-Both are made from the products of the run. Every product is optional: a page has sections for the products that exist.
-All ranks measure a rollout together. Each page is made, drawn and written by one rank.
+Rank 0 makes both from the products of the run and from the measures of its rollouts. Every product is optional: the
+page has sections for the products that exist. Rollouts without current measures are measured first, by all ranks.
 """
 
 from __future__ import annotations
@@ -11,17 +11,15 @@ import csv
 import io
 import json
 import logging
-import os
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.velocity_gradients import vorticity
 from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.io.fields import FieldSeries
@@ -30,302 +28,271 @@ from eddies.io.provenance import (others_trained_on, product_attributes, product
                                   read_provenance)
 from eddies.io.trajectories import Trajectory
 from eddies.measures import finite
-from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
-from eddies.pipeline import MAKER_OF
-from eddies.report import (figures, forced, ground_truth, kernel, model, reconstruction, rollout, stationary, steps,
+from eddies.pipeline import FILE_OF, MAKER_OF
+from eddies.report import (figures, ground_truth, kernel, models, reconstruction, rollouts, stationary, steps, summary,
                            tracers)
-from eddies.report import variants as table_of_variants
-from eddies.report.page import Metric, RunRecord, Section, arranged, shown, write_page
+from eddies.report.figures import Variant
+from eddies.report.page import Section, strict, write_page
 from eddies.scene.scene import Scene, SceneError, load_scene
+from eddies.scene.terms import PRESETS
+from eddies.workflows.ground_truth.stationary import read_stationary_span
 from eddies.workflows.problems import directory_problems
 from eddies.workflows.product_warnings import doubts, not_finite, old_products
 from eddies.workflows.run_directory.work import read_stage_seconds
 from eddies.workflows.variant_rows import (COLUMNS, ROLLOUT, add_break_even, machine, notes, numbers, rows_of,
                                            simulation_seconds)
-from eddies.workflows.variants import rollouts
-
-if TYPE_CHECKING:
-    from eddies.analysis.rollout import Rollout
-    from eddies.workflows.rollout.measured import MeasuredRollout  # needs torch
+from eddies.workflows.variants import rollouts as rollouts_of
 
 log = logging.getLogger("eddies")
 
-ROLLOUT_COST = {"seconds_per_step": "rollout: seconds of a step (median, without storing)",
-                "particles": "particles of the rollout",
-                "ranks": "ranks of the rollout"}
+MOST_SHOWN = 6  # largest number of variants in the figures
 SIMULATION = "dns_seconds_per_turnover"
+COSTS = {"dns_seconds_per_step": "DNS: seconds of a step (median, without storing)",
+         SIMULATION: "DNS: wall seconds per turnover (median step, mean number of steps)",
+         "stage_seconds": "wall seconds by stage"}
+REASONS = {SIMULATION: "the simulation took no step",
+           "stage_seconds": "no stage_seconds.json: the stages were not run by `eddies`"}
 SOURCE_OF_TRACKS = ("{in_file} measured tracks from {file}, on average {mean_count:.0f} in a frame; {complete} are in "
                     "all frames. Fields are reconstructed from them by least squares. The dissipation rate is the "
                     "value of the literature for this velocity and integral scale.")
-MAIN_PAGE = 3  # time to make the main page, divided by that of another page; a round takes as long as the main page
-Row = dict[str, Any]
 
 
 @dataclass
-class Page:
-    """A page of the report, made by one rank.
-
-    directory: run directory of the products. seconds: wall seconds by stage. provenance: provenance by kind of product.
-    not_finite: a sentence on each product with numbers that are not finite. cost: the metrics of cost.
-    """
-
-    directory: Path
-    seconds: dict[str, float]
-    provenance: dict[str, dict[str, Any]] = field(default_factory=dict)
-    not_finite: list[str] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-    cost: list[Metric] = field(default_factory=list)
-    stationary: StationarySpan | None = None
-    sections: list[Section] = field(default_factory=list)
-
-    @property
-    def simulation_seconds(self) -> float | None:
-        """Wall seconds per turnover of the direct simulation; None without one, or if it took no step."""
-        return next((metric.value for metric in self.cost if metric.key == SIMULATION), None)
-
-
-def _draw(sections: Sequence[Section]) -> None:
-    """Draw the figures of sections, then free them. A figure that fails is left out with a warning."""
-    for illustration in (each for section in sections for each in section.illustrations):
-        try:
-            illustration.png = figures.png(illustration.figure)
-        except Exception as error:  # an error of matplotlib or its settings must not lose the rest of the report
-            log.warning("report: a figure is left out, because drawing %s fails (%s: %s)", illustration.name,
-                        type(error).__name__, error)
-        illustration.figure = None
-
-
-@dataclass(frozen=True)
 class Report:
-    """The pages of the report on a run directory.
+    """A run directory, and the report that is made of it.
 
-    scene_name: name of the scene. runs: directories of the rollouts of each variant, by name. pages: run directory of
-    each variant that was run, by name; the main page comes first. If no variant has a rollout, there is one page, of
-    the run directory itself, under the name "". output: directory of the reports; None: "report" in each directory.
-    old: products that were made with other settings than those of the last job, as `old_products`.
+    Parameters
+    ----------
+    scene : None if it cannot be read.
+    variants : directories of the rollouts of each variant, by name. A run without variants counts as one variant.
+    chosen : names of the variants to show.
+    old : products that were made with other settings than those of the last job, as `old_products`.
+    sections : the content of the page.
+    provenance : that of the products in the directory `base`, by kind.
+    numbers : the content of metrics.json without warnings.
+    scanned : a sentence on each product with numbers that are not finite, else "", by file.
+    kept : measures that could not be written beside their rollout, by its directory.
     """
 
     directory: Path
-    scene_name: str
-    runs: Mapping[str, Sequence[Path]]
-    pages: Mapping[str, Path]
-    output: Path | None = None
+    scene: Scene | None
+    variants: Mapping[str, Sequence[Path]]
+    chosen: Sequence[str] = ()
     old: Mapping[Path, Sequence[str]] = field(default_factory=dict)
+    sections: list[Section] = field(default_factory=list)
+    provenance: dict[str, dict[str, Any]] = field(default_factory=dict)
+    numbers: dict[str, Any] = field(default_factory=dict)
+    scanned: dict[Path, str] = field(default_factory=dict)
+    kept: dict[Path, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, directory: Path, chosen: Sequence[str] = ()) -> Report:
+        """Return a report without content. Raises SceneError if `chosen` names an unknown variant."""
+        scene, runs, old = None, {}, {}
+        with contextlib.suppress(SceneError):
+            scene = load_scene(directory / "scene.toml")
+        if scene is not None:
+            scene.check_variants(chosen)
+            old = old_products(scene, directory)
+            if scene.simulation is not None:
+                runs = {name: [*found] for name, found in rollouts_of(scene, directory).items()}
+        name = scene.name if scene is not None else directory.resolve().name
+        return cls(directory, scene, runs or {name: [directory]}, chosen, old)
 
     @property
-    def main(self) -> str:
-        """The variant of the main page."""
-        return next(iter(self.pages))
+    def rollouts(self) -> list[Path]:
+        """The directories of all rollouts that exist."""
+        return [where for runs in self.variants.values() for where in runs if (where / ROLLOUT).exists()]
 
-    def measured(self, name: str) -> list[Path]:
-        """Return the directories of the rollouts of a variant."""
-        return list(filter(_has_rollout, self.runs[name] if name else [self.directory]))
+    @cached_property
+    def ran(self) -> list[str]:
+        """Names of the variants with a rollout. Those to show come first, then those that were made with the settings
+        of the scene."""
+        found = {name: runs[0] / ROLLOUT for name, runs in self.variants.items() if (runs[0] / ROLLOUT).exists()}
+        return sorted(found, key=lambda name: (name not in self.chosen, bool(self.old.get(found[name]))))
 
-    def report_of(self, page: Path) -> Path:
-        """Return the directory of the report about the run directory `page`."""
-        return page / "report" if self.output is None else self.output / page.relative_to(self.directory)
+    @property
+    def shown(self) -> list[str]:
+        """Names of the variants in the figures: those in `chosen` that were run, or else the first ones."""
+        return ([name for name in self.chosen if name in self.ran] or self.ran)[:MOST_SHOWN]
 
-    def links(self, page: Path) -> list[tuple[str, str]]:
-        """Return the titles and relative paths of the other pages, for links on the page of the run directory
-        `page`."""
-        found = [] if page == self.directory else [(f"all of {self.scene_name}", self.directory)]
-        found += [(name, where) for name, where in self.pages.items() if where not in (page, self.directory)
-                  and not (page == self.directory and name == self.main)]
-        return [(title, os.path.relpath(self.report_of(where) / "index.html", self.report_of(page)))
-                for title, where in found]
+    @property
+    def base(self) -> Path:
+        """The directory whose products the page describes: that of the first variant shown."""
+        return self.variants[self.shown[0]][0] if self.shown else self.directory
+
+    def scene_of(self, name: str) -> Scene | None:
+        """Return the scene of a variant."""
+        return self.scene and self.scene.variant.get(name, self.scene)
+
+    @cached_property
+    def looks(self) -> dict[str, figures.Look]:
+        """The colour and the marker of each variant."""
+        known = {name: self.scene_of(name) for name in self.variants}
+        cells = {name: each.coarse_cells for name, each in known.items() if each is not None and each.coarse_cells}
+        return figures.looks({name: [name, *_presets(each)] for name, each in known.items()}, cells)
+
+    def variant(self, name: str, numbers: Mapping[str, Any], tables: Mapping[str, figures.Table]) -> Variant:
+        """Return a variant for figures."""
+        scene = self.scene_of(name)
+        return Variant(scene and scene.label or name, self.looks[name], numbers, tables)
+
+    def first(self, found: Mapping[str, Any]) -> list[Any]:
+        """Return the values of the variants that are shown or, if there are none, the first values."""
+        return [found[name] for name in self.shown if name in found] or [*found.values()][:MOST_SHOWN]
+
+    @contextlib.contextmanager
+    def opened(self, directory: Path, kind: str, alone: Comm) -> Iterator[File | None]:
+        """Open a product and scan it; None if there is none."""
+        path = directory / FILE_OF[kind]
+        if not path.exists():
+            yield None
+            return
+        with open_product(alone, path, kind) as file:
+            if path.resolve() not in self.scanned:
+                self.scanned[path.resolve()] = not_finite(file, kind)
+            yield file
 
 
-def _has_rollout(directory: Path) -> bool:
-    return (directory / ROLLOUT).exists()
-
-
-def _plan(directory: Path, chosen: Sequence[str] = (), output: Path | None = None) -> tuple[Scene | None, Report]:
-    """Return the scene of a run directory and the pages to make. The scene is None if it cannot be read.
-
-    The main page shows the first variant in the list `chosen` that was run. If none of them was run, it shows the first
-    variant of the scene that was run with the settings of the scene or, if there is none, with others.
-    """
-    scene, runs, old = None, {}, {}
-    with contextlib.suppress(SceneError):
-        scene = load_scene(directory / "scene.toml")
-    if scene is not None:
-        scene.check_variants(chosen)
-        old = old_products(scene, directory)
-        if scene.simulation is not None:
-            runs = {name: [*scenes] for name, scenes in rollouts(scene, directory).items()}
-    ran = {name: first for name, (first, *_) in runs.items() if _has_rollout(first)}
-    present = [name for name, first in ran.items() if not old.get(first / ROLLOUT)]
-    main = next((name for name in (*chosen, *present, *ran) if name in ran), "")
-    return scene, Report(directory, scene.name if scene else "", runs, {main: ran.get(main, directory), **ran}, output,
-                         old)
+def _presets(scene: Scene | None) -> Iterator[str]:
+    """Yield the presets whose terms move the particles of a scene, or its method if no model does."""
+    if scene is not None and scene.simulation is not None and not scene.needs_model:
+        yield scene.simulation.method
+    elif scene is not None and scene.model is not None:
+        yield from (name for name, terms in PRESETS.items() if set(terms) == set(scene.model.terms))
 
 
 def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: StopRequest | None = None,
         output: Path | None = None) -> None:
-    """Write report/index.html, report/figures/*.png and report/metrics.json of a run directory; all ranks call it.
+    """Write report/index.html, report/figures/*.png, report/metrics.json and report/variants.csv of a run directory;
+    all ranks call it. If `output` is given, the files are written there.
 
-    If `output` is given, the files are written there, and the reports of variants in directories below it.
-
-    The page of a scene with variants begins with the table of the variants. The details of one variant follow: the
-    first variant in `variants` that was run, or else the first variant of the scene that was run. Each variant that was
-    run also has a page of its own.
+    The figures show the variants `variants`, as far as they were run, or else the first variants of the scene.
 
     Raises ProductError if the directory holds no product or a damaged one, or if the report cannot be written. Raises
-    SceneError if `variants` names an unknown variant, and Stopped, before any page is written, if `stop` requests it.
+    SceneError if `variants` names an unknown variant, and Stopped, before anything is written, if `stop` requests it.
     """
     directory, stop = Path(directory), stop or StopRequest(comm)
     for problem in directory_problems(("report",), comm, directory) if output is None else ():
         raise SceneError(problem)
-    scene, report = in_files(comm, directory, lambda: _plan(directory, variants, output))
-    alone = comm.Split(comm.rank)
+    report = in_files(comm, directory, lambda: Report.of(directory, variants))
+    for where in report.rollouts:
+        _measure().update(where, comm, None if output is None else report.kept)
+        stop.check()
+    stop.check()
+    alone, output = comm.Split(comm.rank), output or directory / "report"
     try:
-        made, found = _make(report, comm, alone, stop)
-        own = [page for page in made.values() if page.directory != directory]
-        on_all_ranks(comm, lambda: in_files(alone, directory, lambda: [
-            _write(report, page, page.directory) for page in own]), ProductError)
-        for name, where in report.pages.items():
-            if where != directory:
-                log.info("report: variant %s: %s", name, report.report_of(where) / "index.html")
-        text = scene.to_toml() if scene is not None and scene.variant else ""
-        in_files(comm, report.report_of(directory), lambda: _write_main(
-            report, made[report.main], *_compare(scene, report, made[report.main], found, comm.size, alone), text))
+        in_files(comm, output, lambda: [_make(report, comm.size, alone), _write(report, output)])
     finally:
         alone.Free()
 
 
 def sections_of(directory: Path, alone: Comm) -> list[Section]:
-    """Make all sections of the main page of a run directory on one rank, with figures that are not yet drawn."""
-    scene, report = _plan(directory)
-    report = replace(report, pages={report.main: report.pages[report.main]})
-    made, found = _make(report, alone, alone, StopRequest(alone), draw=False)
-    page = made[report.main]
-    return [*_compare(scene, report, page, found, 1, alone)[0], *page.sections]
+    """Return the sections of the report of a run directory on one rank, with figures that are not yet made."""
+    report = Report.of(directory)
+    for where in report.rollouts:
+        _measure().update(where, alone, report.kept)
+    _make(report, 1, alone)
+    return report.sections
 
 
-def _make(report: Report, comm: Comm, alone: Comm, stop: StopRequest,
-          draw: bool = True) -> tuple[dict[str, Page], dict[str, list[Row]]]:
-    """Make the pages. Return the pages of this rank, and the `numbers` of all rollouts, by name of the variant.
-
-    All ranks measure each rollout together, and the rank that makes the variant's page collects the results. Then each
-    rank makes its pages, in rounds (`_makers`). A variant has no numbers if one of its rollouts is missing. Raises
-    Stopped, after the rollouts of a variant or after a round, if `stop` requests it.
-    """
-    names = list(report.pages) + [name for name in report.runs if name not in report.pages]
-    (makers, rounds), made, found, truths, scanned = _makers(names, comm.size), {}, {}, {}, {}
-    with ExitStack() as files:
-        measured: dict[str, list[MeasuredRollout]] = {name: [] for name in names}
-        for name in names:
-            for where in report.measured(name):
-                from eddies.workflows.rollout.measured import open_rollout  # needs torch
-                opened = on_all_ranks(comm, lambda where=where: files.enter_context(open_rollout(where, alone)),
-                                      ProductError)
-                shown = where == report.pages.get(name)
-                opened.measure(comm, makers[name], shown, shown and name == report.main, truths)
-                measured[name].append(opened)
-            stop.check()
-
-        def make(name: str) -> None:
-            if name in report.pages:
-                page = made[name] = read_page(report.pages[name], alone, next(iter(measured[name]), None), scanned,
-                                              report.old, main=name == report.main)
-                if draw:
-                    _draw(page.sections)
-            if report.main and len(measured[name]) == len(report.runs[name]):
-                found[name] = [numbers(each) for each in measured[name]]
-            for each in measured[name]:
-                each.forget()
-
-        for turn in range(max(rounds.values()) + 1):
-            own = [name for name in names if (makers[name], rounds[name]) == (comm.rank, turn)]
-            on_all_ranks(comm, lambda: [in_files(alone, report.directory, lambda: make(name)) for name in own],
-                         ProductError)
-            stop.check()
-    return made, {name: each for part in comm.allgather(found) for name, each in part.items()}
+def _measure() -> Any:
+    from eddies.workflows import measure  # needs torch, which other runs do not
+    return measure
 
 
-def _makers(names: Sequence[str], ranks: int) -> tuple[dict[str, int], dict[str, int]]:
-    """Return two mappings by name of a page: the rank that makes the page, and the round in which this rank makes it.
+def _make(report: Report, ranks: int, alone: Comm) -> None:
+    """Read the products and the measures of a run, and add the content of its report. `ranks` is the number of ranks of
+    the job."""
+    measures = {where: report.kept.get(where) or _measure().read(where, alone) for where in report.rollouts}
+    found = {name: report.variant(name, *measures[runs[0]]) for name, runs in report.variants.items()
+             if runs[0] in measures}
+    shared = _shared(report, alone)
+    if not report.provenance:
+        raise ProductError(f"{report.directory}: holds none of {', '.join(stage.file for stage in MAKER_OF.values())}; "
+                           "run `eddies dns SCENE` first")
+    if report.scene is not None and found:
+        report.sections.append(_compare(report, measures, shared[0].numbers.get(SIMULATION), ranks, alone))
+    if found:
+        drawn = report.first(found)
+        numbers = {name: rollouts.rollout_numbers(each.numbers, read_stage_seconds(report.variants[name][0]))
+                   for name, each in found.items()}
+        report.numbers["rollouts"] = numbers
+        report.numbers["forced"] = {name: each.numbers["forced"] for name, each in found.items()
+                                    if "forced" in each.numbers}
+        report.sections.append(rollouts.section(drawn, report.first(numbers), len(found) - len(drawn)))
+        if forced := [each for each in drawn if "forced" in each.numbers]:
+            report.sections.append(rollouts.forced_section(forced))
+    _add_learned(report, alone)
+    report.sections += shared
+    report.numbers |= {section.key: section.numbers for section in shared}
+    seconds = report.numbers["cost"]["stage_seconds"] or {}
+    stages = {MAKER_OF[kind].name: {"wall seconds": seconds.get(MAKER_OF[kind].name), **origin}
+              for kind, origin in report.provenance.items()}
+    report.sections.append(Section("run", "The run", columns={
+        key: {stage: origin[key] for stage, origin in stages.items()}
+        for key in ("wall seconds", "ranks", "date", "eddies", "commit", "libraries")}))
+    report.numbers["warnings"] = [*doubts(report.base, report.provenance, report.old), *_other_doubts(report),
+                                  *(words for words in report.scanned.values() if words)]
 
-    The first page is the main page. It takes about as long as three other pages; each round takes as long.
-    """
-    makers, rounds, load = {}, {}, [0] * ranks
-    for number, name in enumerate(names):
-        rank = makers[name] = load.index(min(load))
-        rounds[name] = load[rank] // MAIN_PAGE
-        load[rank] += 1 if number else MAIN_PAGE
-    return makers, rounds
 
-
-def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, scanned: dict[Path, str],
-              old: Mapping[Path, Sequence[str]], main: bool) -> Page:
-    """Read the products of a run directory and return its page. The figures are not drawn.
-
-    scanned: results of `not_finite` by file; new results are added. old: see `Report`. main: whether this is the main
-    page, which shows everything. Other pages have fewer figures, and no sections on products that are links to other
-    directories.
-    """
-    page = Page(directory, read_stage_seconds(directory))
+def _shared(report: Report, alone: Comm) -> list[Section]:
+    """Read the products in the base directory and add their provenance. Return the sections on costs and on products of
+    the whole run."""
+    cost: dict[str, Any] = {}
+    sections: list[Section] = []
     readers = {
         "ground_truth": _ground_truth_sections,
         "kernel": lambda file: [kernel.section(read_json(file, "description")["support"], **{
             name: read_table(file, name) for name in ("kernels", "slices", "errors")})],
         "reconstruction": lambda file: [reconstruction.section(
             read_attributes(file, "about"), read_table(file, "errors_over_time"),
-            read_table(file, "errors_of_fields") if "errors_of_fields" in file else {}, _middle_plane(file))],
-        "model": lambda file: [_model_section(file, page, main)],
-        "step": lambda file: [steps.section(read_attributes(file, "found"), {
-            name: read_table(file, f"trials/{name}") for name in file["trials"]})],
-        "rollout": lambda file: _rollout_sections(measured.rollout, page, main)}
+            read_table(file, "errors_of_fields") if "errors_of_fields" in file else {}, _middle_plane(file))]}
     for kind in MAKER_OF:
-        path = directory / f"{kind}.h5"
-        if not path.exists():
-            continue
-        with open_product(alone, path, kind) as file:
-            page.provenance[kind] = read_provenance(file)
-            if path.resolve() not in scanned:
-                scanned[path.resolve()] = not_finite(file, kind)
-            if found := scanned[path.resolve()]:
-                page.not_finite.append(found)
-            page.cost += _cost(file, kind)
-            if kind == "ground_truth" and "stationary" in file:
-                with contextlib.suppress(ProductError):  # the section on stationary turbulence shows the error
-                    page.stationary = read_stationary_span(file)
-            if main or not path.is_symlink():
-                page.sections += _sections_or_notice(kind, page, lambda: readers[kind](file))
-    if not page.provenance:
-        raise ProductError(f"{directory}: holds none of {', '.join(f'{kind}.h5' for kind in MAKER_OF)}; "
-                           "run `eddies dns SCENE` first")
-    page.warnings = [*doubts(directory, page.provenance, old), *page.not_finite]
-    page.sections = arranged([*page.sections, _cost_section(page)])
-    return page
+        with report.opened(report.base, kind, alone) as file:
+            if file is not None:
+                report.provenance[kind] = read_provenance(file)
+                if kind == "ground_truth" and "tracks" not in file:
+                    cost = _simulation_cost(file)
+                if kind in readers:
+                    sections[:0] = readers[kind](file)
+    seconds = {**read_stage_seconds(report.directory), **read_stage_seconds(report.base)}
+    return [Section("cost", "Cost", "Wall seconds of stages and of steps.", {**cost, "stage_seconds": seconds or None},
+                    COSTS, REASONS), *sections]
 
 
-def _sections_or_notice(kind: str, page: Page, read: Callable[[], list[Section]]) -> list[Section]:
-    """Return the sections on a product. If numbers that are not finite prevent this, return one section with a
-    notice."""
-    try:
-        return read()
-    except (ValueError, OverflowError) as error:  # NaN or infinity in the limits of a figure, a PDF or a count
-        if not page.not_finite:
-            raise
-        title = kind.replace("_", " ").capitalize()
-        return [Section(kind, title, notices=[f"Not shown ({error}): {'; '.join(page.not_finite)}"])]
+def _add_learned(report: Report, alone: Comm) -> None:
+    """Add sections on the models and the steps of the variants."""
+    trained: dict[str, Variant] = {}
+    searches: dict[str, Variant] = {}
+    for name, (where, *_) in report.variants.items():
+        with report.opened(where, "model", alone) as file:
+            if file is not None:
+                trained[name] = report.variant(name, *_model(file))
+        with report.opened(where, "step", alone) as file:
+            if file is not None:
+                searches[name] = report.variant(name, read_attributes(file, "found"), {
+                    method: read_table(file, f"trials/{method}") for method in file["trials"]})
+        with report.opened(where, "rollout", alone):
+            pass
+    for key, part, all_of_it in (("models", models, trained), ("steps", steps, searches)):
+        if all_of_it:
+            report.numbers[key] = {name: part.numbers_of(each) for name, each in all_of_it.items()}
+            report.sections.append(part.section(report.first(all_of_it)))
 
 
-def read_stationary_span(file: File) -> StationarySpan:
-    """Return the span of an open ground_truth.h5 over which its stationary state is averaged.
-
-    Raises ProductError if the span holds fewer than three samples.
-    """
-    span, scene = read_attributes(file, "stationary"), tomllib.loads(read_provenance(file)["scene"])
-    forced_below = scene["forcing"]["wavenumber"] if "forcing" in scene else 0.0
-    try:
-        return StationarySpan(read_table(file, "statistics"), read_table(file, "spectra_of_statistics")["energy"],
-                              read_attributes(file, "reference")["viscosity"], span["start"], span["end"], forced_below)
-    except ValueError as error:
-        raise ProductError(f"{file.filename}: {error}; raise [spin_up] stationary and run `eddies dns` again") from None
+def _model(file: File) -> tuple[dict[str, Any], dict[str, figures.Table]]:
+    """Return what the report shows of model.h5, as `models.section` needs it."""
+    provenance = read_provenance(file)
+    source, others = provenance.get("source"), others_trained_on(provenance)
+    if source and "truths" in source:
+        others = [path if reached is None else f"{path} (M_t = {reached:.3f})"
+                  for path, reached in source["truths"].items()]
+    return {**read_json(file, "description"), "provenance": provenance, "others": others}, {
+        name: read_table(file, name) for name in (
+            "a_priori", "acceleration_sample", "density_rate_sample", "history", "source_a_priori") if name in file}
 
 
 def _ground_truth_sections(file: File) -> list[Section]:
@@ -365,132 +332,77 @@ def _middle_plane(file: File) -> np.ndarray | None:
     return series.read(-1, "velocity", middle, middle + 1)[0, 0] if "velocity" in series.variables else None
 
 
-def _model_section(file: File, page: Page, main: bool) -> Section:
-    provenance = page.provenance["model"]
-    tables = {name: read_table(file, name) if name in file else None for name in (
-        "a_priori", "acceleration_sample", "density_rate_sample", "history", "source_a_priori")}
-    source, others = provenance.get("source"), others_trained_on(provenance)
-    if source and "truths" in source:
-        others = [path if reached is None else f"{path} (M_t = {reached:.3f})"
-                  for path, reached in source["truths"].items()]
-    part = model.section(read_json(file, "description"), tables["a_priori"], tables["acceleration_sample"],
-                         tables["density_rate_sample"], tables["history"] if main else None,
-                         source and source["path"], others)
-    if source and tables["source_a_priori"] is not None:
-        part.metrics += model.source_metrics(provenance["mach_turbulent"], tables["a_priori"],
-                                             source["mach_turbulent"], tables["source_a_priori"])
-    return part
+def _simulation_cost(file: File) -> dict[str, Any]:
+    """Return the cost of the steps of the direct simulation in an open ground_truth.h5."""
+    statistics, turnover = read_table(file, "statistics"), file["reference"].attrs["eddy_turnover_time"]
+    seconds = float(np.median(statistics["seconds_per_step"]))
+    elapsed = np.diff(statistics["time"])
+    steps = (elapsed / statistics["time_step"][1:]).sum() / elapsed.sum() * turnover if len(elapsed) else None
+    return {"dns_seconds_per_step": seconds, SIMULATION: None if steps is None else float(steps) * seconds}
 
 
-def _rollout_sections(measured: Rollout, page: Page, main: bool) -> list[Section]:
-    sections = [rollout.section(measured, main)]
-    if measured.forced and page.stationary is not None and len(measured.truth.times):
-        sections.append(forced.section(measured, page.stationary))
-    return sections
+def _other_doubts(report: Report) -> Iterator[str]:
+    """Yield warnings about the rollouts in other directories than the base directory."""
+    for where in [each for runs in report.variants.values() for each in runs if each != report.base]:
+        beside = {kind: origin for kind in MAKER_OF if (origin := product_provenance(where / FILE_OF[kind]))}
+        yield from (f"{where.relative_to(report.directory)}: {sentence}"
+                    for sentence in doubts(where, beside, report.old) if sentence.startswith(ROLLOUT))
 
 
-def _cost(file: File, kind: str) -> list[Metric]:
-    """Return metrics of the cost of the steps of a simulation or rollout; empty for other products."""
-    if kind == "ground_truth" and "tracks" in file:
-        return []
-    if kind == "ground_truth":
-        statistics, turnover = read_table(file, "statistics"), file["reference"].attrs["eddy_turnover_time"]
-        seconds = float(np.median(statistics["seconds_per_step"]))
-        elapsed = np.diff(statistics["time"])
-        steps = (elapsed / statistics["time_step"][1:]).sum() / elapsed.sum() * turnover if len(elapsed) else None
-        return [Metric("dns_seconds_per_step", "DNS: seconds of a step (median, without storing)", seconds),
-                Metric(SIMULATION, "DNS: wall seconds per turnover (median step, mean number of steps)",
-                       None if steps is None else float(steps) * seconds, "the simulation took no step")]
-    if kind != "rollout":
-        return []
-    attributes = read_attributes(file, "rollout")
-    untimed = "too few steps to time: the first two, and the first two after a restart, are left out"
-    found = [Metric(key, label, attributes.get(key), untimed) for key, label in ROLLOUT_COST.items()]
-    if "evaluations" in attributes and attributes["turnovers"] > 0:
-        found += [Metric("storing_share", "rollout: share of the wall time that storing took",
-                         attributes.get("storing_share"), "made by an earlier version"),
-                  Metric("evaluations_per_turnover", "evaluations of the forces per turnover",
-                         attributes["evaluations"] / attributes["turnovers"])]
-    return found
+def _compare(report: Report, measures: Mapping[Path, Sequence[Any]], of_truth: float | None, ranks: int,
+             alone: Comm) -> Section:
+    """Return the section on all variants, and add rows, summary and what belongs to them to the numbers of the report.
 
-
-def _cost_section(page: Page) -> Section:
-    metrics = [*page.cost, Metric("stage_seconds", "wall seconds by stage", page.seconds or None,
-                                  "no stage_seconds.json: the stages were not run by `eddies`")]
-    if "rollout" not in page.provenance:
-        metrics += [Metric(key, label, None, "there is no rollout.h5") for key, label in ROLLOUT_COST.items()]
-    return Section("cost", "Cost", "Wall seconds of stages and of steps.", metrics=metrics,
-                   main=("seconds_per_step",))
-
-
-def _compare(scene: Scene | None, report: Report, page: Page, found: Mapping[str, Sequence[Row]], ranks: int,
-             alone: Comm) -> tuple[list[Section], dict[str, str]]:
-    """Return the section on all variants, in a list, and the texts of variants.csv and variants.json, by file name.
-    Warnings about the rollouts of the other pages are added to those of the main page.
-
-    Both results are empty if no variant was run. page: the main page. found: `numbers` of each variant's rollouts.
-    ranks: the number of ranks of the job.
+    measures: numbers and tables of each rollout, by its directory. of_truth: seconds of a turnover of the ground truth.
     """
-    if not report.main:
-        return [], {}
+    scene = report.scene
     variants = scene.variant or {scene.name: scene}
-    for where in [each for runs in report.runs.values() for each in runs if each != page.directory]:
-        beside = {kind: origin for kind in MAKER_OF if (origin := product_provenance(where / f"{kind}.h5"))}
-        page.warnings += [f"{where.relative_to(report.directory)}: {sentence}"
-                          for sentence in doubts(where, beside, report.old) if sentence.startswith(ROLLOUT)]
-    rows, another = rows_of(scene, report.runs, found, alone, report.old)
+    found = {name: [numbers(measures[where][0]) for where in runs] for name, runs in report.variants.items()
+             if all(where in measures for where in runs)}
+    rows, another = rows_of(scene, report.variants, found, alone, report.old)
     repeating = [name for name, each in variants.items() if each.coarse_cells == each.flow.cells]
-    simulation = simulation_seconds(rows, repeating, page.simulation_seconds)
+    simulation = simulation_seconds(rows, repeating, of_truth)
     add_break_even(rows, simulation)
-    table = table_of_variants.ErrorAgainstTime(rows, report.main)
-    remarks = notes(scene.realisations or (), another, {name: each.tracers for name, each in variants.items()},
-                    {name: each.coarse_cells for name, each in variants.items()})
-    lines = io.StringIO(newline="")
-    writer = csv.DictWriter(lines, COLUMNS)
-    writer.writeheader()
-    writer.writerows(rows)
-    reference = product_attributes(page.directory / "ground_truth.h5", "reference")
+    table = summary.ErrorAgainstTime(rows, report.shown[0], report.looks)
+    reference = product_attributes(report.base / FILE_OF["ground_truth"], "reference")
     flow = {key: finite(float(value)) for key, value in reference.items() if isinstance(value, (float, np.number))}
-    record = {"name": scene.name, "title": scene.title, "machine": machine(scene.device, ranks), "flow": flow,
-              "simulation_seconds": simulation, "rows": rows, "summary": table.summary}
-    return [table_of_variants.section(table, remarks)], {
-        "variants.csv": lines.getvalue(), "variants.json": json.dumps(record, indent=2, allow_nan=False) + "\n"}
+    report.numbers |= {"name": scene.name, "title": scene.title, "machine": machine(scene.device, ranks), "flow": flow,
+                       "simulation_seconds": simulation, "rows": rows, "summary": table.summary}
+    return summary.section(table, notes(scene.realisations or (), another, variants))
 
 
-def _write_main(report: Report, page: Page, first: Sequence[Section], beside: Mapping[str, str], text: str) -> None:
-    """Write the main page, which begins with the sections `first`, and log its numbers; one rank calls it. `beside` and
-    `text` are arguments of `_write`."""
-    _draw(first)
-    page.sections = [*first, *page.sections]
-    page.seconds = {**read_stage_seconds(report.directory), **page.seconds}
-    _write(report, page, report.directory, beside, text)
-    for section in page.sections:
+def _draw(sections: Sequence[Section]) -> None:
+    """Draw the figures of sections. A figure that fails is left out with a warning."""
+    for illustration in (each for section in sections for each in section.illustrations):
+        try:
+            illustration.png = figures.png(illustration.make())
+        except Exception as error:  # an error of matplotlib or its settings must not lose the rest of the report
+            log.warning("report: a figure is left out, because drawing %s fails (%s: %s)", illustration.name,
+                        type(error).__name__, error)
+
+
+def _write(report: Report, output: Path) -> None:
+    """Draw the figures, write the page and the numbers, and log the main numbers; one rank calls it."""
+    _draw(report.sections)
+    warnings = report.numbers["warnings"]
+    text = report.scene.to_toml() if report.scene is not None and report.scene.variant else (
+        list(report.provenance.values())[-1]["scene"])
+    texts = {"metrics.json": json.dumps(strict(report.numbers), indent=2, allow_nan=False) + "\n"}
+    if "rows" in report.numbers:
+        lines = io.StringIO(newline="")
+        writer = csv.DictWriter(lines, COLUMNS)
+        writer.writeheader()
+        writer.writerows(report.numbers["rows"])
+        texts["variants.csv"] = lines.getvalue()
+    write_page(output, report.sections, texts, name=report.directory.resolve().name, scene=text, warnings=warnings,
+               title=tomllib.loads(text).get("title", "untitled scene"))
+    for section in report.sections:
         count = len(section.illustrations)
         log.info("report: %s%s", section.title, f" ({count} figure{'s' if count > 1 else ''})" if count else "")
-        if section.key == table_of_variants.KEY:
+        if section.key == "summary":
             log.info("  %s", section.text)
-        for metric in section.metrics:
-            if metric.key in section.main:
-                log.info("  %-60s %s", metric.label, "-" if metric.value is None else shown(metric.value))
-    for warning in page.warnings:
+            (_, *titles), *rows = section.table
+            for label, *cells in rows:
+                log.info("  %s: %s", label, ", ".join(map(" ".join, zip(titles, cells))))
+    for warning in warnings:
         log.warning("report: %s", warning)
-
-
-def _write(report: Report, page: Page, directory: Path, beside: Mapping[str, str] | None = None,
-           text: str = "") -> None:
-    """Write the page of a run directory, a file with its numbers, and further files.
-
-    `beside` holds the texts of the further files by file name. `text` is the scene that the page shows, as TOML. If it
-    is empty, the page shows the scene of the last product.
-    """
-    rows = [("stage", "ranks", "wall time (s)", "date", "eddies", "commit", "libraries")]
-    for kind, origin in page.provenance.items():
-        stage = MAKER_OF[kind].name
-        rows.append((stage, str(origin["ranks"]),
-                     shown(page.seconds[stage]) if stage in page.seconds else "not stored", origin["date"],
-                     origin["eddies"], origin["commit"][:12] if origin["commit"] else "not a checkout",
-                     ", ".join(f"{name} {version}" for name, version in origin["libraries"].items())))
-    text = text or list(page.provenance.values())[-1]["scene"]
-    title = tomllib.loads(text).get("title", "untitled scene")
-    record = RunRecord(directory.resolve().name, title, text, rows, page.warnings, report.links(directory))
-    write_page(report.report_of(directory), record, page.sections, beside or {})

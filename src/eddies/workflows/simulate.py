@@ -28,6 +28,7 @@ from eddies.particles.devices import prepare_torch
 from eddies.particles.particle_set import as_numpy
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene
+from eddies.workflows import measure
 from eddies.workflows.ground_truth.frame_counts import rollout_start
 from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.rollout.method import Method, TimeStep, forcing_of, make_method
@@ -38,7 +39,7 @@ log = logging.getLogger("eddies")
 
 
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
-    """Run the rollout of a scene and write rollout.h5.
+    """Run the rollout of a scene, write rollout.h5, and measure the rollout.
 
     If the state becomes faulty, the rollout ends. The product then holds the frames so far, and its status describes
     the fault. A stopped rollout continues from its newest checkpoint.
@@ -75,6 +76,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 for name, columns in method.series().items():
                     write_table(file, name, Table({"time": course.times, **columns}, "time", {"time": "T"}))
     guard.checkpoints.remove()
+    measure.run(directory, comm)
     pace = (pace_in_words(outcome["seconds_per_step"], outcome["storing_share"]) if "seconds_per_step" in outcome
             else "too few steps to time")
     log.info("rollout: %.2f turnovers, %s; %s", outcome["time"] / turnover, pace, outcome["status"])

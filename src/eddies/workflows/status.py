@@ -15,7 +15,7 @@ from eddies.io.provenance import product_fingerprint, product_provenance
 from eddies.io.run_lock import job_in
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
-from eddies.pipeline import MAKER_OF, STAGES, Stage
+from eddies.pipeline import FILE_OF, MAKER_OF, STAGES, Stage
 from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.workflows.estimates import in_units
 from eddies.workflows.run_directory.fingerprints import set_files, stage_fingerprint
@@ -59,8 +59,8 @@ def _state(path: Path) -> str:
 
 def products_in(directory: Path) -> list[Path]:
     """Return the products of all runs in a directory, sorted by path. A link to one of these products is left out."""
-    found = sorted((path for stage in MAKER_OF.values() for path in directory.rglob(stage.file)), key=Path.is_symlink,
-                   reverse=True)
+    found = (path for file in FILE_OF.values() for path in directory.rglob(file))
+    found = sorted(found, key=Path.is_symlink, reverse=True)
     return sorted({path.resolve(): path for path in found}.values())
 
 

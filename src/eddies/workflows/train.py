@@ -161,7 +161,7 @@ class LearningCurves:
         try:
             from eddies.report import figures  # matplotlib takes a while to start
             from eddies.report.learning import curves
-            write_files({self.path: figures.png(curves(training.columns()))})
+            write_files({self.path: figures.png(curves({"": (training.columns(), figures.MODEL)}))})
         except (Exception, SystemExit) as error:  # from matplotlib, its settings or the disk: the training continues
             self._failed = True
             log.warning("train: cannot draw %s (%s: %s); the training continues without it", self.path,

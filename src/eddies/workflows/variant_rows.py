@@ -9,11 +9,10 @@ from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from eddies.analysis.against_truth import accuracy
 from eddies.analysis.pareto import break_even
 from eddies.cores import threads
 from eddies.io.hdf5 import open_product
@@ -21,12 +20,9 @@ from eddies.io.provenance import environment, read_json
 from eddies.measures import MEASURES, finite
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES
-from eddies.scene.scene import Scene, Tracers
+from eddies.scene.scene import Scene
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import FAILURE, of_other_settings, read_found_step, step_path
-
-if TYPE_CHECKING:
-    from eddies.workflows.rollout.measured import MeasuredRollout  # needs torch
 
 COST = ("seconds_per_step", "time_step", "wall_seconds", "wall_seconds_low", "wall_seconds_high", "core_seconds",
         "ranks")
@@ -171,13 +167,10 @@ def before(model: Path | None, step: Path | None, alone: Comm) -> dict[str, Any]
     return found
 
 
-def notes(seeds: Sequence[int], without_kernel: Sequence[str], tracers: Mapping[str, Tracers],
-          cells: Mapping[str, int]) -> list[str]:
+def notes(seeds: Sequence[int], without_kernel: Sequence[str], variants: Mapping[str, Scene]) -> list[str]:
     """Return the sentences that a reader needs to interpret the numbers.
 
-    seeds: seeds of the realisations. without_kernel: names of the variants without the numbers THROUGH_KERNEL. tracers:
-    the tracers of each variant. cells: the number of cells along each side of each variant's coarse grid, 0 without
-    one.
+    seeds: seeds of the realisations. without_kernel: names of the variants without the numbers THROUGH_KERNEL.
     """
     found = [f"Mean and standard deviation over {len(seeds)} realisations, seeds {', '.join(map(str, seeds))}, that no "
              "training has seen." if len(seeds) > 1 else
@@ -186,36 +179,33 @@ def notes(seeds: Sequence[int], without_kernel: Sequence[str], tracers: Mapping[
         blank = " and ".join(MEASURES[measure] for measure in THROUGH_KERNEL)
         found.append(f"{', '.join(without_kernel)}: no {blank}, because these numbers need the smoothing kernel, and "
                      "its settings differ there.")
-    grids = {name: count for name, count in cells.items() if count}
+    grids = {name: each.coarse_cells for name, each in variants.items() if each.coarse_cells}
     if grids:
         kept = ", ".join(f"{(count - 1) // 3} in {name}" for name, count in grids.items())
-        widths = {tracers[name].filter_width for name in grids}
+        widths = {variants[name].tracers.filter_width for name in grids}
         found.append(f"Largest wavenumber |k_i| that a grid keeps by the 2/3 rule: {kept}; the filter wavenumber "
                      f"k_d = pi/d is "
                      f"{', '.join(f'{np.pi / width:.3g}' for width in sorted(widths, reverse=True))}.")
-    if len({(each.particles, each.filter_width) for each in tracers.values()}) > 1:
+    if len({(each.tracers.particles, each.tracers.filter_width) for each in variants.values()}) > 1:
         found.append("Variants have different particles or filters. Compare only those with the same ones.")
     return found
 
 
-def numbers(stored: MeasuredRollout) -> dict[str, Any]:
-    """Return status, accuracy and cost of an open rollout."""
-    rollout, ranks = stored.rollout, stored.provenance["ranks"]
-    attributes = rollout.attributes
-    found = {"status": rollout.status, "ranks": ranks, **accuracy(rollout),
-             "stopped_at": None if rollout.status == "complete" else attributes["turnovers"],
-             "time_step": attributes.get("time_step")}  # missing if the first step failed
-    if "seconds_per_step" in attributes:
-        found |= step_costs(attributes, rollout.turnover, ranks)
+def numbers(measured: Mapping[str, Any]) -> dict[str, Any]:
+    """Return status, accuracy and cost of a rollout from the numbers of its measures.
+
+    Costs are the seconds per step, and per turnover the wall seconds (with quartiles) and the core seconds.
+    """
+    rollout, ranks = measured["attributes"], measured["ranks"]
+    found = {"status": rollout["status"], "ranks": ranks, **measured["accuracy"],
+             "stopped_at": None if rollout["status"] == "complete" else rollout["turnovers"],
+             "time_step": rollout.get("time_step")}  # missing if the first step failed
+    if "seconds_per_step" in rollout:
+        steps = rollout["eddy_turnover_time"] / rollout["time_step"]
+        seconds, low, high = (rollout[f"seconds_per_step{end}"] for end in ("", "_low", "_high"))
+        found |= {"seconds_per_step": seconds, "wall_seconds": seconds * steps, "wall_seconds_low": low * steps,
+                  "wall_seconds_high": high * steps, "core_seconds": seconds * steps * ranks * threads()}
     return found
-
-
-def step_costs(rollout: Mapping[str, Any], turnover: float, ranks: int) -> dict[str, float]:
-    """Return the seconds per step, and per turnover the wall seconds (with quartiles) and the core seconds."""
-    seconds, low, high = (rollout[f"seconds_per_step{end}"] for end in ("", "_low", "_high"))
-    steps = turnover / rollout["time_step"]
-    return {"seconds_per_step": seconds, "wall_seconds": seconds * steps, "wall_seconds_low": low * steps,
-            "wall_seconds_high": high * steps, "core_seconds": seconds * steps * ranks * threads()}
 
 
 def machine(device: str, ranks: int) -> dict[str, Any]:

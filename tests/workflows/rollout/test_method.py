@@ -20,6 +20,7 @@ from eddies.scene.integrators import SCHEMES
 from eddies.scene.scene import BOX_LENGTH, Model, SceneError, load_scene
 from eddies.scene.sections import METHODS
 from eddies.workflows import report, simulate, train
+from eddies.workflows.diff import numbers_of
 from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.rollout.method import SOLVES, ParticleRun, make_method
 from tests.commands import first_rank
@@ -156,7 +157,7 @@ def reported(comm, directory, *remove):
     comm.Barrier()
     report.run(directory, comm)
     comm.Barrier()
-    return json.loads((directory / "report" / "metrics.json").read_text())
+    return numbers_of(directory, None)
 
 
 @pytest.mark.usefixtures("no_figures", "quick_solves")
@@ -168,7 +169,7 @@ def test_a_rollout_that_goes_wrong_ends_there_and_keeps_its_frames(comm, small_p
     assert attributes["status"].startswith("stopped: step") and "nearest particle" in attributes["status"]
     assert len(columns["time"]) >= 1
     metrics = reported(comm, directory, "kernel.h5", "model.h5")
-    assert not metrics["rollout"]["stable"] and metrics["rollout"]["status"] == attributes["status"]
+    assert not metrics["rollouts"]["stable"] and metrics["rollouts"]["status"] == attributes["status"]
 
 
 @pytest.mark.usefixtures("no_figures", "quick_solves")
@@ -199,10 +200,10 @@ def test_models_are_trained_run_and_reported(comm, tmp_path, fluid, model, weigh
     assert attributes["status"] == "complete" and ("density" in columns) == learns_density
     assert ("outside_training" in tables) == ("pairs" in terms)
     metrics = reported(comm, tmp_path, *([] if removals else ["kernel.h5"]))
-    assert metrics["rollout"]["qr_kl"] is metrics["rollout"]["qr_kl_floor"] is None
-    assert metrics["rollout"]["spectrum_error"] > 0
-    assert (metrics["model"]["density_rate_error"] is not None) == learns_density and metrics["rollout"]["stable"]
-    assert metrics["rollout"]["method"] == f"the model, terms {', '.join(terms)}"
+    assert metrics["rollouts"]["qr_kl"] is metrics["rollouts"]["qr_kl_floor"] is None
+    assert metrics["rollouts"]["spectrum_error"] > 0
+    assert (metrics["models"]["density_rate_error"] is not None) == learns_density and metrics["rollouts"]["stable"]
+    assert metrics["rollouts"]["method"] == f"the model, terms {', '.join(terms)}"
 
 
 def test_terms_that_read_the_density_are_refused_in_an_incompressible_flow(tmp_path):

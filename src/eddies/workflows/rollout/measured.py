@@ -1,35 +1,27 @@
-"""Measures of a rollout in a run directory and of the true tracers in its ground truth."""
+"""A rollout in a run directory, the true tracers in its ground truth, and fields and spectra of both."""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from eddies.analysis.rollout import PLANES, Plane, Rollout, same_times
-from eddies.analysis.velocity_gradients import Invariants
+from eddies.analysis.isotropic_turbulence import StationarySpan
+from eddies.analysis.rollout import Rollout, same_times
 from eddies.io.hdf5 import ProductError, open_product, read_attributes, read_table
 from eddies.io.provenance import read_provenance
 from eddies.io.trajectories import IMAGE, Trajectory
-from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.devices import prepare_torch
+from eddies.workflows.ground_truth.stationary import read_stationary_span
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import load_form
 from eddies.workflows.rollout.particle_measures import GRADIENT, ParticleSpectra, ReconstructedFields, WithGradients
-
-log = logging.getLogger("eddies")
-
-Task = tuple[str, str, int]  # quantity ("spectra", "invariants" or "planes"), "model" or "truth", frame
-#: Measures of true tracers. A key holds the files of ground truth and kernel (None for spectra), the quantity, and the
-#: frame of the ground truth. The rank that made a measure holds its value; the other ranks hold None.
-TruthMeasures = dict[tuple[Path, Path | None, str, int], Any]
 
 
 class TrueParticles:
@@ -68,167 +60,54 @@ class TrueParticles:
 
 
 @dataclass(frozen=True)
-class ComputedSeries:
-    """A series with one column. Each frame is computed by `make` when it is read."""
-
-    times: np.ndarray
-    column: str
-    make: Callable[[int], np.ndarray]
-
-    @property
-    def columns(self) -> tuple[str]:
-        """The name of the column."""
-        return (self.column,)
-
-    def read(self, frame: int, column: str) -> np.ndarray:
-        """Compute a frame; `column` is the only column."""
-        return self.make(frame)
-
-
-#: A series without frames, in place of the true tracers if there is no ground truth.
-NOTHING = ComputedSeries(np.zeros(0), "velocity", lambda frame: np.zeros((0, 3)))
-
-
-class OnDemand(dict):
-    """A dict from frames to the values of a function. Each value is computed once, when it is first used."""
-
-    def __init__(self, measure: Callable[[int], Any]) -> None:
-        super().__init__()
-        self._measure = measure
-
-    def __missing__(self, frame: int) -> Any:
-        self[frame] = found = self._measure(frame)
-        return found
-
-
-class MeasuredRollout:
-    """An open rollout on one rank, with its measures at single frames: spectra, invariants of the velocity gradient,
-    and planes of the velocity and the vorticity.
-
-    All ranks can compute measures together with `measure`. Any other measure is computed by this rank when it is first
-    used, and kept.
+class StoredRollout:
+    """An open rollout on one rank.
 
     Parameters
     ----------
-    rollout : the rollout and its truth.
+    rollout : the rollout and its truth, without measures of single frames.
     provenance : provenance of rollout.h5.
-    directory : the run directory.
     fields : the reconstructed fields of "model" and "truth"; empty if the kernel or the ground truth is missing.
     solver : makes spectra of particles; None without a ground truth.
-    stationary : whether the ground truth has a stationary state.
+    stationary : the stationary state of the ground truth; None without one.
     """
 
-    def __init__(self, rollout: Rollout, provenance: Mapping[str, Any], directory: Path,
-                 fields: Mapping[str, ReconstructedFields], solver: ParticleSpectra | None = None,
-                 stationary: bool = False) -> None:
-        self.rollout, self.provenance, self._directory = rollout, provenance, directory
-        self._fields, self._solver, self._stationary = fields, solver, stationary
+    rollout: Rollout
+    provenance: Mapping[str, Any]
+    fields: Mapping[str, ReconstructedFields]
+    solver: ParticleSpectra | None = None
+    stationary: StationarySpan | None = None
 
     @property
     def particles(self) -> dict[str, Any]:
-        """The particles of "model" and "truth", by these names; particles without frames are left out."""
-        return {name: run for name, run in (("model", self.rollout.model), ("truth", self.rollout.truth))
-                if len(run.times)}
+        """The particles of "model" and, if they have frames, those of "truth". With a kernel they have velocity
+        gradients."""
+        runs = {"model": self.rollout.model, "truth": self.rollout.truth}
+        return {name: WithGradients(run, self.fields[name]) if self.fields else run for name, run in runs.items()
+                if name == "model" or len(run.times)}
 
-    @property
-    def exported(self) -> dict[str, dict[str, Any]]:
-        """The series to export: a dict with the keys "fields" and "particles". Each value maps "model" and "truth" to a
-        series.
+    def spectrum(self, of: str, frame: int) -> np.ndarray:
+        """Return the energy spectrum (shells,) of the particles of "model" or "truth" in a frame."""
+        return self.solver.of(getattr(self.rollout, of), frame, of)
 
-        Without a kernel, there are no fields, and the particles have no velocity gradients.
-        """
-        if not self._fields:
-            return {"fields": {}, "particles": self.particles}
-        fields = {name: self._fields[name] for name in self.particles}
-        return {"fields": fields,
-                "particles": {name: WithGradients(run, fields[name]) for name, run in self.particles.items()}}
-
-    @property
-    def groups(self) -> dict[str, Any]:
-        """The series that `open_run` adds to the stored ones. They have names like those of groups in a product."""
-        found: dict[str, Any] = {f"particles/{name}": run for name, run in self.particles.items() if name != "model"}
+    def groups(self) -> dict[str, tuple[np.ndarray, dict[str, Callable[[int], np.ndarray]]]]:
+        """Return the groups that `open_run` adds to the stored ones, by name: times, and for each column a function
+        that returns a frame."""
+        found = {}
         for name, run in self.particles.items():
-            if self._solver is not None:
-                found[f"spectra_of_{name}"] = ComputedSeries(run.times, "energy",
-                                                             self.rollout.spectra[name].__getitem__)
-            if self._fields:
-                found[f"fields/{name}"] = self._fields[name]
-                found[f"gradients/{name}"] = ComputedSeries(run.times, GRADIENT, self._fields[name].gradients)
+            columns = {column: partial(run.read, column=column) for column in run.columns}
+            if self.fields:
+                found[f"gradients/{name}"] = run.times, {GRADIENT: columns.pop(GRADIENT)}
+                found[f"fields/{name}"] = run.times, {"velocity": partial(self.fields[name].read, variable="velocity")}
+            if self.solver is not None:
+                found[f"spectra_of_{name}"] = run.times, {"energy": partial(self.spectrum, name)}
+            if name == "truth":
+                found["particles/truth"] = run.times, columns
         return found
-
-    def measure(self, comm: Comm, root: int = 0, page: bool = True, every_frame: bool = True,
-                known: TruthMeasures | None = None) -> None:
-        """Measure a share of the frames on each rank and collect everything on rank `root`; all ranks call it.
-
-        page: if true, measure what a page of the report shows; if false, only what `accuracy` needs. every_frame: if
-        true, measure the velocity gradient at all common frames and, for a page, spectra at several frames; if false,
-        measure both only at the last common frame. known: measures of true tracers from earlier calls; new ones are
-        added. Ranks other than `root` keep only the measures in `known`. Raises ProductError on all ranks if one of
-        them cannot read a frame.
-        """
-        if self._solver is None:
-            return
-        known = {} if known is None else known
-        prepare_torch("cpu", comm)
-        tasks = on_all_ranks(comm, lambda: self._tasks(page, every_frame), ProductError)
-        new = [task for task in tasks if self._key(task) not in known]
-        own = on_all_ranks(comm, lambda: {(quantity, of, frame): getattr(self.rollout, quantity)[of][frame]
-                                          for quantity, of, frame in new[comm.rank::comm.size]}, ProductError)
-        for maker in (self._solver, *self._fields.values()):
-            maker.forget()  # saves memory, because many rollouts are open at a time
-        for task in new:
-            if task[1] == "truth":
-                known[self._key(task)] = own.get(task)
-        own |= {task: known[self._key(task)] for task in tasks if known.get(self._key(task)) is not None}
-        parts = comm.gather(own, root)
-        if parts is None:
-            self.forget()
-        for part in parts or []:
-            for (quantity, of, frame), value in part.items():
-                getattr(self.rollout, quantity)[of][frame] = value
-        complaints = [words for some in comm.allgather(self._solver.complaints) for words in some]
-        if complaints and comm.rank == 0:
-            log.info("report: %s", complaints[0] + (f" ({len(complaints)} such solves)" if complaints[1:] else ""))
-
-    def forget(self) -> None:
-        """Free all measures. A measure that is used later is computed again."""
-        for measures in (self.rollout.spectra, self.rollout.invariants, self.rollout.planes):
-            for of_frames in (measures or {}).values():
-                of_frames.clear()
-
-    def _tasks(self, page: bool, every_frame: bool) -> list[Task]:
-        """List the measures to make, with `page` and `every_frame` as in `measure`. The list is empty if model and
-        truth have no common frame."""
-        run = self.rollout
-        try:
-            common = run.common
-        except ValueError:
-            return []
-        every = np.arange(len(common.times))
-        chosen = {"spectra": run.shown_spectra(every_frame) if page else np.intersect1d(run.spectral(), every[-1])}
-        if self._fields:
-            chosen["invariants"] = every if every_frame else every[-1:]
-            chosen["planes"] = common.spread(PLANES if page else 0)
-        tasks = [(quantity, of, int(frame)) for quantity, rows in chosen.items()
-                 for of, frames in (("model", common.model), ("truth", common.truth)) for frame in frames[rows]]
-        if page and run.forced and self._stationary:
-            tasks += [("spectra", "model", int(frame)) for frame in run.late_spectra()]
-            if self._fields:
-                tasks += [("invariants", "truth", 0), *(("invariants", "model", int(frame)) for frame in run.late)]
-        return list(dict.fromkeys(tasks))
-
-    def _key(self, task: Task) -> Any:
-        """Return the key in TruthMeasures of a measure of true tracers. Measures of the model are not kept there: for
-        these, return the task itself."""
-        quantity, of, frame = task
-        if of == "model":
-            return task
-        kernel = (self._directory / "kernel.h5").resolve() if quantity != "spectra" else None
-        return (self._directory / "ground_truth.h5").resolve(), kernel, quantity, int(self.rollout.truth.frames[frame])
 
 
 @contextmanager
-def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
+def open_rollout(directory: Path, alone: Comm) -> Iterator[StoredRollout]:
     """Open the rollout of a run directory on one rank, with its ground truth and kernel if they are there.
 
     The ground truth is left out if the rollout was made from another one. Raises ProductError if a file cannot be read.
@@ -249,21 +128,21 @@ def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
             "outside_training": read_table(file, "outside_training")["share"] if "outside_training" in file else None,
             "closure": read_table(file, "closure") if "closure" in file else None}
         if truth_file is None:
-            yield MeasuredRollout(Rollout(attributes, model, NOTHING, {}, {}, {}, None, **tables,
-                                          without_truth=missing), provenance, directory, {})
+            nothing = TrueParticles(model, 0.0, np.zeros(0))
+            yield StoredRollout(Rollout(attributes, model, nothing, {}, {}, {}, None, **tables, without_truth=missing),
+                                provenance, {})
             return
         ground = GroundTruth(truth_file, alone)
-        truth = TrueParticles(ground.trajectory, attributes["start_time"], model.times)
-        both, fields, words = {"model": model, "truth": truth}, {}, ""
+        both = {"model": model, "truth": TrueParticles(ground.trajectory, attributes["start_time"], model.times)}
+        fields, words, span = {}, "", None
         if (directory / "kernel.h5").exists():
             slab = SlabDecomposition(alone, model.length, ground.fields.cells)
             form = load_form(alone, directory / "kernel.h5", ground.scales)
             fields, words = {name: ReconstructedFields(run, form, slab) for name, run in both.items()}, form.words
-        solver = ParticleSpectra(ground.scales, model.length, alone)
-        spectra = {name: OnDemand(lambda frame, name=name: solver.of(both[name], frame, name)) for name in both}
-        invariants = {name: OnDemand(lambda frame, own=own: Invariants.of(own.gradients(frame)))
-                      for name, own in fields.items()}
-        planes = {name: OnDemand(lambda frame, own=own: Plane(*own.plane(frame))) for name, own in fields.items()}
-        rollout = Rollout(attributes, model, truth, read_table(truth_file, "spectra"), ground.reference,
-                          spectra, invariants or None, planes or None, **tables, reconstructed_by=words)
-        yield MeasuredRollout(rollout, provenance, directory, fields, solver, "stationary" in truth_file)
+        if "stationary" in truth_file:
+            with suppress(ProductError):  # the report says that the span is too short
+                span = read_stationary_span(truth_file)
+        empty = [{"model": {}, "truth": {}} if fields else None for _ in range(2)]
+        rollout = Rollout(attributes, *both.values(), read_table(truth_file, "spectra"), ground.reference,
+                          {"model": {}, "truth": {}}, *empty, **tables, reconstructed_by=words)
+        yield StoredRollout(rollout, provenance, fields, ParticleSpectra(ground.scales, model.length, alone), span)

@@ -66,10 +66,6 @@ class ReconstructedFields:
         velocity = velocity - torch.from_numpy(self.particles.read(frame, "velocity").mean(axis=0)).to(velocity)
         return self._by_component(velocity, 2), as_numpy(vorticity).reshape([self.slab.planes] * 2)
 
-    def forget(self) -> None:
-        """Free the results that are kept."""
-        self._kept.clear()
-
     def _once(self, name: str, frame: int, make: Callable[[], Any]) -> Any:
         if name not in self._kept or self._kept[name][0] != frame:
             self._kept[name] = frame, make()
@@ -130,10 +126,6 @@ class ParticleSpectra:
                                           dtype=torch.float32)
         found.most_iterations = MOST_ITERATIONS
         return found
-
-    def forget(self) -> None:
-        """Free the grid of the solves; it is made again when it is needed."""
-        self.__dict__.pop("_resolution", None)
 
     def of(self, particles: Frames, frame: int, whose: str) -> np.ndarray:
         """Return E(k) of shell 0 up to the last shell in which all modes are resolved, and of shell 1 in any case.

@@ -1,10 +1,10 @@
-"""The table of variants and the figure of error against run time."""
+"""The summary of variants: sentences, table, and the figure of error against run time."""
 
 import pytest
 
-from eddies.measures import DRAWN, MEASURES, SHOWN
-from eddies.report.figures import png
-from eddies.report.variants import MOST_NAMED, ErrorAgainstTime, scatter, section
+from eddies.measures import DRAWN, MEASURES
+from eddies.report.figures import looks, png
+from eddies.report.summary import COLUMNS, MOST_NAMED, ErrorAgainstTime, scatter, section
 from eddies.workflows.variant_rows import BEFORE, BREAK_EVEN
 
 
@@ -20,7 +20,16 @@ def row(name, seconds, error, status="complete", stopped_at=None, kind="particle
 ROWS = [row("learned", 20.0, 0.1), row("none", 1.0, 0.5), row("slow", 90.0, 0.2),
         row("sph", 50.0, None, "stopped: step 9, rank 0", 0.37),
         row("refused", None, None, "failed: too few slabs")]
-TABLE = ErrorAgainstTime(ROWS, "learned")
+
+
+def table_of(rows):
+    """The table in which the first variant is the subject."""
+    names = {each["name"]: [each["name"]] for each in rows}
+    cells = {each["name"]: number + 8 for number, each in enumerate(rows) if each["on_grid"]}
+    return ErrorAgainstTime(rows, rows[0]["name"], looks(names, cells))
+
+
+TABLE = table_of(ROWS)
 
 
 def texts(axis):
@@ -35,7 +44,7 @@ def test_what_became_unstable_is_a_cross_at_the_top():
 
 
 def named(*rows):
-    return texts(scatter(ErrorAgainstTime([ROWS[0], *rows], "learned"), ["velocity_error_early"]).axes[0])
+    return texts(scatter(table_of([ROWS[0], *rows]), ["velocity_error_early"]).axes[0])
 
 
 def test_the_subject_and_the_most_accurate_of_the_front_are_named():
@@ -48,15 +57,14 @@ def test_few_points_are_all_named_and_points_side_by_side_once():
     assert named(row("beside", 20.5, 0.101), row("none", 1.0, 0.5)) == {"learned", "none"}
 
 
-@pytest.mark.parametrize("kinds", [1, 6])
-def test_the_legend_is_within_the_figure_below_the_panels(kinds):
-    rows = [row(f"v{number}", 10.0 + number, 0.1, kind=f"a method with a long name, {number}")
-            for number in range(kinds)]
-    figure = scatter(ErrorAgainstTime([*rows, {**ROWS[3], "kind": rows[0]["kind"]}], "v0"), DRAWN)
+@pytest.mark.parametrize("methods", [1, 9])
+def test_the_legend_is_within_the_figure_below_the_panels(methods):
+    rows = [row(f"method-{number}", 10.0 + number, 0.1) for number in range(methods)]
+    figure = scatter(table_of([*rows, ROWS[3]]), DRAWN)
     png(figure)
     (legend,), renderer = figure.legends, figure.canvas.get_renderer()
     box = legend.get_window_extent(renderer)
-    assert len(legend.get_texts()) == kinds + 2
+    assert len(legend.get_texts()) == methods + 2
     assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1 and figure.bbox.y0 <= box.y0
     assert box.y1 <= min(axis.xaxis.label.get_window_extent(renderer).y0 for axis in figure.axes)
 
@@ -68,7 +76,7 @@ def test_front_joins_what_nothing_beats():
 
 
 def test_a_measure_that_nobody_has_leaves_an_empty_panel():
-    axes = scatter(ErrorAgainstTime([row("learned", 20.0, None)], "learned"), DRAWN).axes
+    axes = scatter(table_of([row("learned", 20.0, None)]), DRAWN).axes
     assert texts(axes[0]) == set()
     assert not any("_" in axis.get_ylabel().replace(r"$t_\eta$", "").replace("$k_d$", "") for axis in axes)
 
@@ -78,34 +86,31 @@ def test_the_section_has_notices_summary_notes_figure_and_table():
     assert part.notices == ["sph (at 0.37 T): stopped: step 9, rank 0", "refused: failed: too few slabs"]
     assert all(text in part.text for text in (*TABLE.summary, "A note."))
     assert [figure.name for figure in part.illustrations] == ["error-against-run-time"]
-    assert [metric.label for metric in part.metrics] == [r["name"] for r in ROWS]
-    assert part.metrics[0].value["wall seconds per T"] == 20.0
-    assert list(part.metrics[0].value)[:len(SHOWN)] == [MEASURES[name] for name in SHOWN]
-    without = ErrorAgainstTime([{**each, "qr_kl": None} for each in ROWS], "learned")
-    assert MEASURES["qr_kl"] not in section(without).metrics[0].value
+    assert [label for label, *_ in part.table[1:]] == [r["name"] for r in ROWS]
+    assert part.columns["seconds a turnover"]["learned"] == 20.0
+    assert part.table[0][1:] == list(COLUMNS.values()) and len(COLUMNS) < 8
 
 
 def test_weights_without_their_cost_differ_from_methods_without_weights():
     rows = [{**ROWS[0], "weights": 7}, {**ROWS[1], "weights": 7, "training_seconds": 2.5}, ROWS[2]]
-    shown = [metric.value["training (s)"] for metric in section(ErrorAgainstTime(rows, "learned")).metrics]
-    assert shown == ["not stored", 2.5, None]
+    assert [*section(table_of(rows)).columns["training (s)"].values()] == ["not stored", 2.5, ""]
 
 
 def test_one_variant_has_a_row_and_no_figure():
-    part = section(ErrorAgainstTime(ROWS[:1], "learned"))
-    assert not part.illustrations and len(part.metrics) == 1
+    part = section(table_of(ROWS[:1]))
+    assert not part.illustrations and len(part.table) == 2
 
 
 def test_rows_without_a_time_say_why():
     untimed = [row("learned", None, 0.1), row("sph", None, None, "stopped: step 1", 0.0)]
-    part = section(ErrorAgainstTime(untimed, "learned"))
+    part = section(table_of(untimed))
     assert all("too few steps" in notice for notice in part.notices) and len(part.notices) == 2
 
 
 def test_an_unstable_model_is_worth_nothing():
     """And is not compared with a grid."""
     unstable = [{**ROWS[0], "status": "stopped: step 9", "stopped_at": 0.8}, *ROWS[1:]]
-    summary = ErrorAgainstTime([*unstable, row("grid", 9.0, 0.1, kind="coarse grid")], "learned").summary
+    summary = table_of([*unstable, row("grid", 9.0, 0.1, kind="coarse grid")]).summary
     assert len(summary) == 2 and not any("grid" in sentence for sentence in summary)
 
 
@@ -113,20 +118,19 @@ def test_the_summary_names_the_cheapest_complete_grid_that_is_as_accurate():
     grids = [row("grid-24", 2.0, 0.2, kind="coarse grid"),
              row("grid-48", 9.0, 0.1, kind="coarse grid"),
              row("unstable", 1.0, 0.05, "stopped: step 9", 0.8, kind="coarse grid")]
-    *_, sentence = ErrorAgainstTime(ROWS + grids, "learned").summary
+    *_, sentence = table_of(ROWS + grids).summary
     assert "grid-48" in sentence and "0.45" in sentence and "T/2 and 1 T" in sentence
     # A rollout of T/2 has one time to compare.
     halves = [{**each, "end": 0.501} for each in ROWS + grids[:1]]
-    *_, sentence = ErrorAgainstTime(halves, "learned").summary
+    *_, sentence = table_of(halves).summary
     assert sentence.startswith("No grid") and "T/2" in sentence and " T " not in sentence
     assert len(TABLE.summary) == 2
 
 
 def test_spreads_are_bars_and_in_the_table():
     rows = [{**ROWS[0], "velocity_error_early_spread": 0.04}, ROWS[1]]
-    table = ErrorAgainstTime(rows, "learned")
+    table = table_of(rows)
     bars = [bar.get_segments()[0][:, 1] for container in scatter(table, ["velocity_error_early"]).axes[0].containers
             for bar in container.lines[2][1:]]
     assert bars[0].tolist() == pytest.approx([0.06, 0.14]) and bars[1].tolist() == pytest.approx([0.5, 0.5])
-    shown = [metric.value["velocity error at t_η"] for metric in section(table).metrics]
-    assert shown == ["0.1 ± 0.04", 0.5]
+    assert [*section(table).columns["velocity error at t_η"].values()] == ["0.1 ± 0.04", 0.5]

@@ -1,7 +1,7 @@
-"""The report section on all variants of a scene: error against run time, and a table of all numbers."""
+"""The report section on all variants of a scene: sentences, a table, and the figure of error against run time."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -10,30 +10,24 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from eddies.analysis.pareto import COST, cheapest_grid, pareto_front, verdict
-from eddies.measures import DRAWN, MEASURES, SHOWN
-from eddies.report.figures import (DNS, FILTERED, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels,
-                                   plain_log_ticks, styled)
-from eddies.report.page import Metric, Section
+from eddies.measures import DRAWN, MEASURES
+from eddies.report.figures import DNS, GUIDE, Look, legend_at_foot, letter, panels, plain_log_ticks, styled
+from eddies.report.page import Section
 
 Row = Mapping[str, Any]
 
-KEY = "variants"
-MARKERS = list(zip((MODEL, TRUTH, SECOND, FOURTH, THIRD, DNS, FILTERED), "os^DvPX"))
-# Titles of the columns of the table to the right of the measures, by the keys of their numbers in a row.
-COSTS = {"end": "end of the rollout (T)", "stopped_at": "became unstable at (T)", "wall_seconds": "wall seconds per T",
-         "wall_seconds_low": "wall seconds, lower quartile", "wall_seconds_high": "wall seconds, upper quartile",
-         "core_seconds": "core seconds per T", "seconds_per_step": "seconds per step", "time_step": "time step",
-         "ranks": "ranks", "weights": "number of weights", "training_seconds": "training (s)",
-         "training_steps": "training (steps)", "step_seconds": "search for the step (s)",
-         "break_even_simulation": "cheaper than the direct simulation after (T)",
-         "break_even_grid": "cheaper than the cheapest grid of equal or smaller error at T/2 after (T)"}
+# Columns of the table: key of a number in a row, title.
+COLUMNS = {"wall_seconds": "seconds a turnover", "training_seconds": "training (s)",
+           "velocity_error_early": "velocity error at t_η", "velocity_error_half": "at T/2",
+           "velocity_error_end": "at the end", "spectrum_error": "spectrum error",
+           "energy_ratio": "energy, model / truth"}
 MOST_NAMED, ROOM = 6, (0.18, 0.06)  # ROOM: width and height of a name, in those of a panel
-LEGEND = ("Wall seconds per turnover T, with the quartiles of the time of a step as bars. Bars of errors are standard "
-          "deviations over realisations, if there are several. Dashed line: Pareto front, the variants that no other "
-          "one beats in both error and time. Names: the variant of this page, bold, and the best of the front. "
-          "Crosses: variants that became unstable.")
-CAPTION = ("In the table, spectrum errors, energies and KL divergences (nats) are those at the end of the rollout, "
-           "for stable variants only. T is the eddy turnover time at the release of the tracers.")
+CAPTION = ("Wall seconds per turnover T, with the quartiles of the time of a step as bars. Bars of errors are standard "
+           "deviations over realisations, if there are several. Dashed line: Pareto front, the variants that no other "
+           "one beats in both error and time. Names: the first variant, bold, and the best of the front. Crosses: "
+           "variants that became unstable.")
+TEXT = ("Spectrum error and energy are those at the end of the rollout. T is the eddy turnover time at the release of "
+        "the tracers. All numbers are in metrics.json.")
 
 
 @dataclass(frozen=True)
@@ -41,11 +35,12 @@ class ErrorAgainstTime:
     """The errors and run times of all variants.
 
     rows: for each variant, its numbers by key; a missing number is None. subject: name of the variant with which the
-    others are compared.
+    others are compared. looks: colour and marker of each variant.
     """
 
     rows: Sequence[Row]
     subject: str
+    looks: Mapping[str, Look] = field(default_factory=dict)
 
     @property
     def drawn(self) -> list[str]:
@@ -55,12 +50,6 @@ class ErrorAgainstTime:
         """
         replaced = {} if self.finished("velocity_error_half") else {"velocity_error_half": "velocity_error_end"}
         return [name for name in (replaced.get(name, name) for name in DRAWN) if self.finished(name)]
-
-    @property
-    def markers(self) -> dict[str, tuple[str, str]]:
-        """Colour and marker of each kind of method."""
-        kinds = dict.fromkeys(row["kind"] for row in self.rows)
-        return {kind: MARKERS[number % len(MARKERS)] for number, kind in enumerate(kinds)}
 
     @property
     def summary(self) -> list[str]:
@@ -98,14 +87,14 @@ def is_stable(row: Row) -> bool:
 
 
 def section(table: ErrorAgainstTime, notes: Sequence[str] = ()) -> Section:
-    """Return the section with a summary, `notes` on the numbers, the figure, and the table of errors and costs."""
-    columns = {key: MEASURES[key] for key in SHOWN if any(row[key] is not None for row in table.rows)} | COSTS
-    metrics = [Metric(row["name"], row["label"], {title: _with_spread(row, key) for key, title in columns.items()})
-               for row in table.rows]
-    part = Section(KEY, "Error against run time", " ".join([*table.summary, *notes, CAPTION]), metrics=metrics,
+    """Return the section with a summary, `notes` on the numbers, the table of errors and costs, and the figure."""
+    part = Section("summary", "Summary", " ".join([*table.summary, *notes, TEXT]),
+                   columns={title: {row["label"]: _with_spread(row, key) for row in table.rows}
+                            for key, title in COLUMNS.items()},
                    notices=[_notice(row) for row in table.rows if not is_stable(row) or row[COST] is None])
     if len(table.rows) > 1 and table.drawn:
-        part.add_figure("error-against-run-time", "Error against run time", scatter(table, table.drawn), LEGEND)
+        part.add_figure("error-against-run-time", "Error against run time", lambda: scatter(table, table.drawn),
+                        CAPTION)
     return part
 
 
@@ -120,8 +109,8 @@ def _with_spread(row: Row, column: str) -> Any:
 
     If the file of a trained model lacks the cost of its training, return "not stored" for this cost.
     """
-    if column in ("training_seconds", "training_steps") and row[column] is None and row["weights"] is not None:
-        return "not stored"
+    if column == "training_seconds" and row[column] is None:
+        return "not stored" if row["weights"] is not None else ""
     spread = row.get(f"{column}_spread")
     return row[column] if spread is None else f"{row[column]:.3g} ± {spread:.2g}"
 
@@ -130,44 +119,51 @@ def _with_spread(row: Row, column: str) -> Any:
 def scatter(table: ErrorAgainstTime, measures: Sequence[str]) -> Figure:
     """Draw error against wall seconds per turnover, with one panel for each measure."""
     columns = min(len(measures), 2)
-    styles = [Line2D([], [], color=colour, marker=marker, linestyle="", label=kind)
-              for kind, (colour, marker) in table.markers.items()]
+    drawn = [row for row in table.rows if any(row in table.finished(measure) for measure in measures)]
+    styles = [_entry(table.looks[row["name"]], row["label"]) for row in drawn if not row["on_grid"]]
+    if grids := [row["name"] for row in drawn if row["on_grid"]]:
+        styles.append(_entry(table.looks[grids[-1]], "coarse grids, the finer the darker"))
     if table.stopped():
-        styles.append(Line2D([], [], color=DNS, marker="x", linestyle="", label="unstable"))
+        styles.append(_entry((DNS, "x"), "unstable"))
     styles.append(Line2D([], [], color=GUIDE, linestyle="--", label="Pareto front"))
-    across = 5  # entries in a line of the legend
-    figure, axes = panels(-(-len(measures) // columns), columns, (5.4, 4.2) if columns == 2 else (9.3, 6.0),
-                          foot=0.15 + 0.2 * -(-len(styles) // across))
+    figure, axes = panels(-(-len(measures) // columns), columns, (5.4, 4.2) if columns == 2 else (9.3, 6.0))
     for axis in axes.flat[len(measures):]:
         axis.remove()
     for axis, measure in zip(axes.flat, measures):
         _draw_panel(axis, table, measure)
     letter(axes.flat[:len(measures)])
-    figure.legend(handles=styles, loc="lower center", ncols=across, columnspacing=1.2, handletextpad=0.4)
+    legend_at_foot(figure, styles)
     return figure
 
 
+def _entry(look: Look, label: str) -> Line2D:
+    return Line2D([], [], color=look[0], marker=look[1], linestyle="", label=label)
+
+
 def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
-    rows, stopped = table.finished(measure), table.stopped()
-    axis.set_xscale("log")
-    axis.set_yscale("log")
-    costs = [row[key] for row in [*rows, *stopped] for key in (COST, "wall_seconds_low", "wall_seconds_high")]
-    _set_limits(axis, costs, [row[measure] for row in rows])
+    rows = table.finished(measure)
+    axis.set(xscale="log", yscale="log", xlabel="wall seconds per turnover T", ylabel=in_symbols(MEASURES[measure]),
+             autoscale_on=False)
     for row in rows:
-        colour, marker = table.markers[row["kind"]]
+        colour, marker = table.looks[row["name"]]
         chosen = row["name"] == table.subject
         bars = [[row[COST] - row["wall_seconds_low"]], [row["wall_seconds_high"] - row[COST]]]
         spread = row.get(f"{measure}_spread") or 0.0
         down = min(spread, 0.9 * row[measure])  # a bar on a logarithmic axis does not reach 0
         axis.errorbar(row[COST], row[measure], [[down], [spread]], np.maximum(bars, 0), color=colour, marker=marker,
                       elinewidth=1, markersize=9 if chosen else 6, markeredgecolor=DNS if chosen else colour, zorder=4)
-    for row in stopped:
-        axis.plot(row[COST], _top(axis), color=table.markers[row["kind"]][0], marker="x", markersize=7,
-                  markeredgewidth=1.8, zorder=4)
+    for row in table.stopped():  # a little below the upper edge
+        axis.plot(row[COST], 0.97, transform=axis.get_xaxis_transform(), color=table.looks[row["name"]][0], marker="x",
+                  markersize=7, markeredgewidth=1.8, zorder=4)
     front = pareto_front([row[COST] for row in rows], [row[measure] for row in rows])
     axis.plot([rows[index][COST] for index in front], [rows[index][measure] for index in front], color=GUIDE,
               linestyle="--", linewidth=1.2, zorder=1)
-    axis.set(xlabel="wall seconds per turnover T", ylabel=in_symbols(MEASURES[measure]))
+    for part, (low, high), limit in ((axis.xaxis, axis.dataLim.intervalx, axis.set_xlim),
+                                     (axis.yaxis, axis.dataLim.intervaly, axis.set_ylim)):
+        if high >= low:
+            room = max(high / low, 2) ** 0.18  # for names
+            limit(low / room, high * room)
+        plain_log_ticks(part, subs=(1, 2, 5) if high < 300 * low else (1,))
     for row in _named(axis, table, rows, measure, front):
         axis.annotate(row["label"], (row[COST], row[measure]), (6, 6), textcoords="offset points", fontsize=8.5,
                       annotation_clip=False, zorder=5, fontweight="bold" if row["name"] == table.subject else "normal")
@@ -192,22 +188,3 @@ def _named(axis: Axes, table: ErrorAgainstTime, rows: Sequence[Row], measure: st
 def in_symbols(words: str) -> str:
     """Return a text in which the symbols t_η and k_d are written as formulas."""
     return words.replace("t_η", r"$t_\eta$").replace("k_d", "$k_d$")
-
-
-def _set_limits(axis: Axes, costs: Sequence[float], errors: Sequence[float]) -> None:
-    """Set the limits of both axes, and label their ticks with plain numbers.
-
-    The limits leave room for names and, at the top, for unstable variants.
-    """
-    for values, limit, room, part in ((costs, axis.set_xlim, (0.16, 0.16), axis.xaxis),
-                                      (errors, axis.set_ylim, (0.12, 0.2), axis.yaxis)):
-        lowest, highest = (min(values), max(values)) if values else (0.1, 1.0)
-        span = max(np.log10(highest / lowest), 0.3)
-        limit(lowest * 10 ** (-room[0] * span), highest * 10 ** (room[1] * span))
-        plain_log_ticks(part, subs=(1, 2, 5) if span < 2.5 else (1,))
-
-
-def _top(axis: Axes) -> float:
-    """Return the y value at which unstable variants are drawn: a little below the upper edge of the panel."""
-    low, high = np.log10(axis.get_ylim())
-    return 10 ** (high - 0.03 * (high - low))
