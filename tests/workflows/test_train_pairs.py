@@ -6,7 +6,7 @@ import pytest
 
 from eddies.kernels.pairs import CompiledPairs, Summand
 from eddies.kernels.reconstruction import kernel_numbers
-from eddies.learning import optimization
+from eddies.learning import training
 from eddies.particles import pairs
 from eddies.scene.scene import load_scene
 from eddies.workflows import dns, train
@@ -49,9 +49,9 @@ def test_training_evaluates_pairs_with_ghosts_and_sums_gradients(comm, tmp_path,
         added(where, arrays)
         summed.append((own, [array.copy() for array in arrays]))
 
-    added = optimization.sum_flat
+    added = training.sum_flat
     monkeypatch.setattr(pairs, "CompiledPairs", Counted)
-    monkeypatch.setattr(optimization, "sum_flat", sum_flat)
+    monkeypatch.setattr(training, "sum_flat", sum_flat)
     dns.run(scene, comm, tmp_path)
     train.run(scene, comm, tmp_path)
 
