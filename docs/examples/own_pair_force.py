@@ -42,8 +42,9 @@ class PairForce(eddies.PairTerm):
         width = settings.width
         with torch.random.fork_rng():  # equal weights on all ranks, whatever else draws random numbers
             torch.manual_seed(flow.seed)
-            self.network = torch.nn.Sequential(torch.nn.Linear(5, width), torch.nn.Tanh(), torch.nn.Linear(width, width),
-                                               torch.nn.Tanh(), torch.nn.Linear(width, 2))
+            self.network = torch.nn.Sequential(
+                torch.nn.Linear(5, width), torch.nn.Tanh(), torch.nn.Linear(width, width), torch.nn.Tanh(),
+                torch.nn.Linear(width, 2))
 
     def pair_values(self, pairs) -> torch.Tensor:
         """w (f_x x + f_v v) of each pair, (3, m)."""
