@@ -3,8 +3,6 @@
 No unit of time is special, so round-off is compared with a duration or with an interval between times.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import statistics

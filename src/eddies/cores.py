@@ -4,8 +4,6 @@ mpi_tools/launch.py imports this module before any package is installed. The mod
 library and `eddies.errors`.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -3,8 +3,6 @@
 A path is imported only if a scene or a program of the user names it, never because a stored file names it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import sys

@@ -1,7 +1,5 @@
 """Runs the stages of a scene in a run directory, skips those that are done, and records their wall times."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

@@ -5,8 +5,6 @@ is the operator f(step L), and `combine((operator, state), ...)` applies each op
 States add like arrays.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

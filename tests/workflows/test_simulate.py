@@ -125,7 +125,7 @@ def test_a_stopped_rollout_continues_and_leaves_nothing_else(comm, small_product
     names = {path.name for path in directory.iterdir()}
     simulate.run(scene, comm, directory)
     whole = product(comm, directory)
-    first_rank(comm, (directory / "rollout.h5").unlink)
+    first_rank(comm, lambda: [(directory / name).unlink() for name in ("rollout.h5", "measures.h5")])
     for number in (1, 2):
         with pytest.raises(Stopped, match=f"from step {number} of the rollout"):
             simulate.run(scene, comm, directory, StopAtStep(comm, 1))

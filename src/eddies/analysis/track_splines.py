@@ -10,8 +10,6 @@ damps angular frequencies above mu^(-1/6) / h. It needs no condition at the ends
 parabola, fitted by least squares.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass

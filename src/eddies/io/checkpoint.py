@@ -5,8 +5,6 @@ JSON. A damaged checkpoint (io/damage.py) is not used. Other files of the direct
 then stores their ids.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import re

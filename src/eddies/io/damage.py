@@ -6,8 +6,6 @@ variable length without a checksum, and may crash when it reads damaged ones. Th
 length, as other programs expect; this package does not read them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

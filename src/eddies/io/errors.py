@@ -1,7 +1,5 @@
 """Errors about files, for users. Each message names the file, the reason and the remedy in one line."""
 
-from __future__ import annotations
-
 import errno
 import os
 from collections.abc import Iterator

@@ -11,8 +11,6 @@ Supported layouts of other codes, with arrays [z, y, x] whose first point is the
   attributes `Lx`, `Ly`, `Lz` of `info_simul/params/oper` are the edges of the box.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import tomllib

@@ -5,8 +5,6 @@ with a trajectory `00000` of consecutive frames, and metadata.json. Velocities a
 differences of positions between frames, so they have the unit of length.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

@@ -8,8 +8,6 @@ until the user removes LOCK. If a file system has no flock, users expect eddies 
 and any line in LOCK refuses other jobs.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import fcntl

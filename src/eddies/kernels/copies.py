@@ -5,8 +5,6 @@ end. The gap between them stays zero. Arrays that are used many times are `Descr
 to return an address. Arrays must be contiguous and of the given precision; ValueError otherwise.
 """
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable, Iterator, Sequence
 

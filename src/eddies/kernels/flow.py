@@ -1,7 +1,5 @@
 """Pointwise formulas of the direct numerical simulation."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable, Sequence
 

@@ -1,7 +1,5 @@
 """Weights of kriging, and sums of neighbours' values with these weights."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Sequence
 

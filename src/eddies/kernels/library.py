@@ -1,7 +1,5 @@
 """The compiled library: one shared object for each instruction set. The best one that the processor runs is loaded."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import hashlib

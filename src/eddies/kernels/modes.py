@@ -1,7 +1,5 @@
 """Loops over the modes of a vector field, for the method of conjugate gradients on solenoidal modes."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Sequence
 

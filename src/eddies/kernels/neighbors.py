@@ -1,7 +1,5 @@
 """Lists of neighbouring points, and the pairs in them."""
 
-from __future__ import annotations
-
 import ctypes
 from dataclasses import dataclass
 

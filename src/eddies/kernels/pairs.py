@@ -1,7 +1,5 @@
 """Sums over pairs of particles within a radius, and gradients through them."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass

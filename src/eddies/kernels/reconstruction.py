@@ -1,7 +1,5 @@
 """Fields from particles: sums at the points of a regular grid."""
 
-from __future__ import annotations
-
 import ctypes
 
 import numpy as np

@@ -1,7 +1,5 @@
 """B-splines around points: interpolation from the planes of a grid, and its transpose."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Training of the particle model on frames of the ground truth (Eqs. 12 to 15)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

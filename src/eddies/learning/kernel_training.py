@@ -1,7 +1,5 @@
 """Training of the smoothing kernel on filtered fields and the particles in them (Eqs. 8 to 11)."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

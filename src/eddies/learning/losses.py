@@ -1,7 +1,5 @@
 """Parts of the losses of Eqs. 12 to 15: a rank's share of a mean square, histograms, and their divergence."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Training through several steps of the simulation: the trajectory loss of Eq. 12 over a window of frames."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace

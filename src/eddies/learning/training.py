@@ -1,7 +1,5 @@
 """The course of a training: optimiser, phases, validation, the best state of the model, and a state for checkpoints."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass

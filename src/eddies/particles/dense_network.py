@@ -1,7 +1,5 @@
 """A small fully connected network with tanh layers, evaluated at many points at once."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """The device and the number of threads of torch."""
 
-from __future__ import annotations
-
 import torch
 
 from eddies.cores import threads

@@ -1,7 +1,5 @@
 """Rates of change of a set of particles: the model with its halo, neighbour list and resolved velocity."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

@@ -1,8 +1,6 @@
 """Tensors over all ranks: ghost particles, changes of rank, sums and means, which are differentiable, and norms, which
 are not."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Detection of particles in a faulty state, and a description of the first one."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

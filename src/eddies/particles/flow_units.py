@@ -1,7 +1,5 @@
 """Units of a flow: measured scales that make a model dimensionless, and the size of particles' neighbourhoods."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

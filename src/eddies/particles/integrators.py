@@ -1,7 +1,5 @@
 """Time steps of particles: velocity Verlet, plain and corrected, and Runge-Kutta of second, third and fourth order."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

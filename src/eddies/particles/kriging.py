@@ -1,7 +1,5 @@
 """Kriging: values and derivatives of a smooth field from its values at neighbouring particles."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cached_property

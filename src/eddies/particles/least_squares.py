@@ -1,7 +1,5 @@
 """Regularised least squares for the solenoidal modes of a velocity that is known at points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,8 +1,6 @@
 """Pairs of neighbouring particles in the units of a model, and sums over each particle's neighbours, by torch or by the
 compiled library."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Particles at one moment as samples of a velocity field: averages (Eqs. 5 and 6) and kriging, and their gradients."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """The periodic cube of the particles."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """A resolved velocity with memory: the mean of its prior is based on a forecast from the previous moment."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ r >= h, its support. The published form of the learned kernel is the exception: 
 brings its integral only near one. It has a `mean_volume` L^3/N, the V_j of Eq. 6, and its sums are not normalised.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Protocol

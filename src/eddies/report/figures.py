@@ -1,7 +1,5 @@
 """Colours and fonts of all figures, and functions that draw parts of figures."""
 
-from __future__ import annotations
-
 import functools
 import io
 import itertools

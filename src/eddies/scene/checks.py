@@ -4,8 +4,6 @@ The checks run when a scene is made. Each check compares some sections and yield
 the key at fault, "section.key", and a text with the reason and a remedy.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence

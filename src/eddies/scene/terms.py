@@ -4,8 +4,6 @@ A class of settings is a section of a scene: a frozen dataclass whose fields dec
 module does not need torch.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """`eddies check`: estimates and problems of a scene before a run. The command writes no file."""
 
-from __future__ import annotations
-
 import json
 import logging
 from collections.abc import Iterator, Mapping

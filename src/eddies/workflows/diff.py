@@ -1,7 +1,5 @@
 """`eddies diff`: print the settings in which two runs differ, and the numbers in which their reports differ."""
 
-from __future__ import annotations
-
 import sys
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`eddies dns`: make a ground truth by direct numerical simulation, with spin-up, filter and tracers."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress

@@ -1,7 +1,5 @@
 """`eddies export`: write each series of fields or particles of a run to a file for other programs, on rank 0."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

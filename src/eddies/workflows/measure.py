@@ -1,7 +1,5 @@
 """Measures of a rollout: the numbers and small arrays by which it is compared with its truth, in measures.h5."""
 
-from __future__ import annotations
-
 import json
 import logging
 from pathlib import Path

@@ -3,8 +3,6 @@
 Each text names the key, its value, the reason and a remedy.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import shutil

@@ -1,8 +1,6 @@
 """Warnings of a report: products that do not belong together or were made with other settings, and numbers that are not
 finite."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,8 +1,6 @@
 """Fields from particle tracks: velocity, gradient, pressure and acceleration of each frame, with an estimate of errors.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial

@@ -3,8 +3,6 @@
 `Course` is the loop over steps and frames, with its checkpoints.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Sequence

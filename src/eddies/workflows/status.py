@@ -1,7 +1,5 @@
 """`eddies status`: print the state of run directories, that is, stages, their settings, checkpoints, jobs and sizes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Least squares for measured particles. Cross-validation finds the weight of the noise."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol

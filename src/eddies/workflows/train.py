@@ -3,8 +3,6 @@
 The model is then tested a priori over the whole ground truth.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Train the smoothing kernel on filtered fields, with and without their gradients, and compare it with SPH kernels."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from pathlib import Path

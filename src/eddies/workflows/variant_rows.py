@@ -1,7 +1,5 @@
 """The rows of the table of variants, and a description of the machine on which the times were measured."""
 
-from __future__ import annotations
-
 import math
 import os
 import platform

@@ -12,8 +12,6 @@ A scene without variants and realisations has one step, in the run directory. Ot
 Each directory is a complete run directory: products that are made elsewhere with the same settings are linked into it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Eddy viscosity and density diffusion between two particles: the terms Pi of Eq. 3."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

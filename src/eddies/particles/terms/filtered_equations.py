@@ -1,7 +1,5 @@
 """The filtered equations of motion by kriging among neighbours, without a grid."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -3,8 +3,6 @@
 The module also has the weights, directions and scaling that all sums over pairs use.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

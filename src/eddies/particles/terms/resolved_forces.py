@@ -1,7 +1,5 @@
 """Forces from the resolved velocity: pressure, viscosity, hidden stress, damping, relaxation and forcing."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -4,8 +4,6 @@ W is the cubic spline. Its support is the radius of interaction, and the smoothi
 of a particle and c the sound speed of the flow.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -5,8 +5,6 @@ with a filtered field. The training window is the first part of the ground truth
 truth that it covers.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

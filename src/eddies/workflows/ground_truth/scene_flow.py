@@ -1,7 +1,5 @@
 """Build the flow of a scene: the fluid on its grid, the choice of its time step, and its initial state."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Iterator

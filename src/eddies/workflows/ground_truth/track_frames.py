@@ -1,7 +1,5 @@
 """Frames of measured tracks in the units of a scene. Splines give missing velocities. Tracks may have gaps."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

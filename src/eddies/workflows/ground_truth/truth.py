@@ -1,7 +1,5 @@
 """Read the ground truth: frames of particles, fields and scales."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property

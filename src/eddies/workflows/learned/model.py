@@ -1,7 +1,5 @@
 """Build a model for a flow, and read models and smoothing kernels from files."""
 
-from __future__ import annotations
-
 import json
 import logging
 from dataclasses import replace

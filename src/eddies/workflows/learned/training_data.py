@@ -3,8 +3,6 @@
 A ground truth is that of the run itself, or one that [training] truths names.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Collection, Iterator, Sequence

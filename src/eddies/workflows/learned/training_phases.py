@@ -3,8 +3,6 @@
 If there are several ground truths, the steps alternate between them, and a validation error is the mean over them.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Rollouts by Eulerian large-eddy simulation on a coarse grid. Particles follow the filtered velocity of the flow."""
 
-from __future__ import annotations
-
 import math
 import time
 from typing import Any

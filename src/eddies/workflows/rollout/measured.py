@@ -1,7 +1,5 @@
 """A rollout in a run directory, the true tracers in its ground truth, and fields and spectra of both."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass

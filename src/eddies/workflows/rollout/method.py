@@ -1,8 +1,6 @@
 """The methods that move the particles of a rollout: their interface, particles that a model or no force moves, and the
 choice of the method of a scene."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Fields and spectra that one rank computes from particles at one time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any

@@ -1,7 +1,5 @@
 """How products depend on the scene: fingerprints of stages, and the provenance that is stored in a product."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Sequence

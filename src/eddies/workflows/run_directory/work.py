@@ -3,8 +3,6 @@
 Work that fits the settings of the scene is kept or continued. Other work would be replaced.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import tomllib
