@@ -134,7 +134,7 @@ def test_a_stopped_rollout_continues_and_leaves_nothing_else(comm, small_product
     comm.Barrier()
     simulate.run(scene, comm, directory)
     assert_same(product(comm, directory), whole, "after two stops")
-    assert {path.name for path in directory.iterdir()} == names | {"rollout.h5"}
+    assert {path.name for path in directory.iterdir()} == names | {"rollout.h5", "measures.h5"}
 
 
 @pytest.mark.mpi(3)

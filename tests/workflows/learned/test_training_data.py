@@ -266,8 +266,7 @@ def test_unfit_truths_are_refused_before_any_work(comm, tmp_path):
 
 @pytest.mark.mpi(1)
 def test_another_truth_limits_the_number_of_ranks(comm, tmp_path):
-    """It has 8 planes, the own one 14. Slabs must hold the radius of interaction, 2.5 planes, and the way of particles
-    within the horizons."""
+    """It has 8 planes, the own one 14. Slabs must hold the radius of interaction, 2.5 planes."""
     other = made(comm, tmp_path, "tracers.particles_per_side=4", "training.batch=60", runs=("other",))
     assert planes_for(other.tracers.particles) == 8
     place = f'[training] truths: "{tmp_path / "other"}"'
@@ -284,8 +283,3 @@ def test_another_truth_limits_the_number_of_ranks(comm, tmp_path):
         # The own ground truth, and weights of another run, allow more ranks.
         taken = replace(scene, model=replace(scene.model, path="runs/other"))
         assert not [*rank_problems(most_ranks(scene.ground_truth_alone), 3), *rank_problems(most_ranks(taken), 3)]
-
-    with changed(tmp_path / "other/ground_truth.h5") as file:
-        file["reference"].attrs["velocity_rms"] = 30.0
-    scene = trained_on(scene_of(tmp_path, "tracers.particles_per_side=8"), tmp_path / "other")
-    assert most_ranks(scene)[f"{place}: ghost planes of the grid in the training through horizons"] == 1
