@@ -32,7 +32,8 @@ from step import best, transform_bounds
 
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import planes_for, resolved_shells
-from eddies.report.figures import BLUE, FOURTH, MODEL, SECOND, THIRD, letter, panels, png, styled
+from eddies.report import figures
+from eddies.report.figures import BLUE, GRID, MODEL, SECOND, THIRD, letter, panels, png, styled
 from eddies.scene.scene import BOX_LENGTH, Scene, load_scene
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.estimates import estimate, most_ranks
@@ -301,16 +302,17 @@ def seconds_of(found: dict, model: str, ranks: int, threads: int) -> tuple[np.nd
 
 def over_particles(axis: Axes, found: dict) -> None:
     """Seconds per evaluation on two ranks, with slopes."""
-    for model, colour in zip(measured_models(found), (BLUE, MODEL, FOURTH)):
+    looks = figures.looks({model: [model] for model in measured_models(found)}, {})
+    for model, (colour, marker) in looks.items():
         side, seconds = seconds_of(found, model, 2, 1)
         slope = np.polyfit(np.log(side[2:] ** 3), np.log(seconds[2:]), 1)[0]
-        axis.loglog(side**3, seconds, "o-", color=colour, label=f"{model}, slope {slope:.2f}")
+        axis.loglog(side**3, seconds, marker=marker, color=colour, label=f"{model}, slope {slope:.2f}")
     cells = np.array([row["cells"] for row in found["grid"]])
-    axis.loglog((cells / CELLS_A_PARTICLE) ** 3, [row["seconds_per_step"] / 4 for row in found["grid"]], "s-",
-                color=SECOND, label="grid of 1.5 cells a particle")
+    axis.loglog((cells / CELLS_A_PARTICLE) ** 3, [row["seconds_per_step"] / 4 for row in found["grid"]],
+                marker=GRID, color=BLUE, label="grid of 1.5 cells a particle")
     axis.loglog(64**3, NOTEBOOKS, "*", color="black", markersize=10)
     axis.annotate("published notebooks", (64**3, NOTEBOOKS), xytext=(-6, -3), textcoords="offset points", ha="right")
-    axis.loglog(64**3, PAPER, "D", color=THIRD, label="the paper, one A100")
+    axis.loglog(64**3, PAPER, "P", color=MODEL, label="the paper, one A100")
     axis.set_xticks([side**3 for side in SIDES], [f"{side}³" for side in SIDES])
     axis.minorticks_off()
     axis.set(title="two cores", xlabel="particles", ylabel="seconds an evaluation")

@@ -7,10 +7,10 @@ import numpy as np
 
 from eddies.analysis.against_truth import EDGES, mean_energy
 from eddies.analysis.block_averages import Blocks, Estimate
+from eddies.analysis.errors import spectrum_error
 from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.pdfs import bin_probabilities, kl_divergence, standardized
 from eddies.analysis.rollout import Frames, Rollout, second_half
-from eddies.analysis.errors import spectrum_error
 from eddies.analysis.velocity_gradients import InvariantBins, Invariants
 from eddies.spectral.mode_operators import gaussian_transfer
 

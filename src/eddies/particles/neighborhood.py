@@ -261,7 +261,8 @@ def at_home(decomposition: SlabDecomposition, columns: dict[str, Tensor], reach:
     Differentiable, collective also in the backward pass.
     """
     columns = {**columns, "position": PeriodicBox(decomposition.length).wrap(columns["position"])}
-    position = as_numpy(columns["position"])
+    # A position that is not finite goes anywhere: the next update of halo and list reports it.
+    position = np.nan_to_num(as_numpy(columns["position"]))
     migration = Migration(decomposition, as_numpy(columns["id"]), position)
     ids, position = migration.ids, migration.apply(position)
     numbers = int(ids.max(initial=0)) + 1

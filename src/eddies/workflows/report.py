@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from eddies.analysis.velocity_gradients import vorticity
 from eddies.analysis.tracer_statistics import tracer_statistics
+from eddies.analysis.velocity_gradients import vorticity
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import File, ProductError, in_files, open_product, read_attributes, read_table
 from eddies.io.provenance import (others_trained_on, product_attributes, product_provenance, read_json,
