@@ -1,0 +1,56 @@
+"""The rungs of the ladder: their terms give what they state, on any number of ranks."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import eddies
+from eddies.workflows.learned.model import initial_model
+from eddies.workflows.learned.source import ModelDefinition
+from tests.particles.configurations import SCALES, alone, assert_close, by_id, distributed, dynamics_of, given, state
+
+LADDER = Path(__file__).parents[1] / "docs" / "ladder" / "ladder.toml"
+RUNGS = "nearest-60", "density-constant", "density-of-pressure", "density-decay", "shift", "shift-alone", "to-neighbors"
+ITERATIONS = 6
+COUNT = 3000  # particles, which have 88 neighbours on average within the radius of "nearest-60"
+
+
+def rung(comm, name):
+    """The model of a rung with initial parameters, in double precision."""
+    return initial_model(ModelDefinition.of(eddies.load_scene(LADDER).variant[name]), SCALES, comm)
+
+
+@torch.no_grad()
+def rates_of(slab, particles, model):
+    found = given(dynamics_of(slab, model, iterations=ITERATIONS).rates(particles))
+    return {name: by_id(slab.comm, particles, rate, COUNT) for name, rate in found.items()}
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("name", RUNGS)
+def test_rates_of_a_rung_do_not_depend_on_the_ranks(comm, name):
+    columns, model = state(COUNT), rung(comm, name)
+    found, expected = (rates_of(*placed, model) for placed in (distributed(comm, *columns), alone(*columns)))
+    assert found.keys() == expected.keys() >= {"acceleration"}
+    for quantity, reference in expected.items():
+        assert torch.isfinite(reference).all()
+        assert_close(found[quantity], reference, 1e-11)
+    assert ("shift_velocity" in found) == name.startswith("shift")
+    assert name != "density-constant" or not found["density_rate"].any()
+
+
+@pytest.mark.mpi(1)
+def test_the_force_is_that_of_the_sixty_nearest(comm):
+    """A neighbour beyond them changes nothing, one among them does."""
+    position, velocity, density = state(COUNT)
+    model = rung(comm, "nearest-60")
+    slab, particles = alone(position, velocity, density)
+    before = rates_of(slab, particles, model)["acceleration"][0]
+    apart = slab.length * ((position - position[0]) / slab.length + 0.5).remainder(1) - slab.length / 2
+    order = apart.norm(dim=1).argsort()
+    for place, same in ((62, True), (30, False)):
+        changed = velocity.clone()
+        changed[order[place]] += 1.0
+        after = rates_of(*alone(position, changed, density), model)["acceleration"][0]
+        assert torch.equal(after, before) == same
