@@ -23,6 +23,7 @@ import eddies
 from eddies.flow.navier_stokes import IncompressibleFluid
 from eddies.flow.subgrid import Closure, StressModel
 from eddies.flow.tracers import FilteredField, TracerParticles, release
+from eddies.parallel.halo import HaloError
 from eddies.parallel.migration import IdOrder
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
@@ -81,10 +82,10 @@ class Exact(Closure):
 class ExactForce(eddies.Term):
     """The force of the exact stress on particles, at the time of the evaluation."""
 
-    Settings = declared.Pressure
+    Settings = declared.Viscosity  # it reads the resolved velocity, and gives an acceleration
 
     def __init__(self, flow: FlowUnits, force: Modes) -> None:
-        super().__init__(declared.Pressure(), flow)
+        super().__init__(declared.Viscosity(), flow)
         self.force, self.time = force, 0.0
 
     def forward(self, context) -> eddies.Rates:
@@ -95,7 +96,8 @@ class Timed(ParticleDynamics):
     """Dynamics that tell the term `exact` the time."""
 
     def rates_after(self, delay: float, particles: ParticleSet) -> eddies.Rates:
-        self.model.terms["exact"].time = self.time + delay
+        if "exact" in self.model.terms:
+            self.model.terms["exact"].time = self.time + delay
         return super().rates_after(delay, particles)
 
 
@@ -183,8 +185,12 @@ def on_grid(truth: Truth, cells: int, every: int, steps: int, closure: Closure |
     for number in range(truth.steps // steps):
         closure.begin_step(state)
         closure.time = number * step
-        state = stepper(state, step)
-        tracers.advance(state, step)
+        with np.errstate(over="ignore", invalid="ignore"):
+            state = stepper(state, step)
+        try:
+            tracers.advance(state, step)
+        except HaloError:  # the flow has become unstable
+            return errors | {"unstable_after": number * step / truth.turnover}, state
         for name, share in TIMES.items():
             if (number + 1) * steps == round(share * truth.steps):
                 errors |= truth.errors(name, tracers.columns, state, cells, grid)
@@ -201,7 +207,8 @@ def with_particles(truth: Truth, every: int, steps: int, form: str, integrator: 
     if form != "exact":
         terms["relaxation"] = Relaxation(declared.Relaxation(), units)
     if form == "model":
-        terms["stress"], terms["exact"].force = Stress(declared.Stress(), units), lambda time: np.zeros(1)
+        del terms["exact"]
+        terms["stress"] = Stress(declared.Stress(), units)
     dynamics.model = LagrangianModel(terms, units)
     dynamics.begin()
     scheme, errors = INTEGRATORS[integrator](dynamics), {}
