@@ -1,6 +1,6 @@
 """Oracles of the ladder, from its run: the true density at each step, and two errors of one force. Takes minutes.
 
-    .venv/bin/python docs/ladder/oracles.py runs/ladder
+    .venv/bin/python docs/ladder/oracles.py runs/ladder runs/networks
 
 The force of `density-constant`, which has no equation for the density, is evaluated with the true density at the places
 of the particles, or with that of the same particle in the truth. For all trained rungs the error of the acceleration at
@@ -29,9 +29,8 @@ from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.ground_truth.truth import GroundTruth, open_truth
 from eddies.workflows.learned.model import particles_for
 from eddies.workflows.rollout.method import ParticleRun, TimeStep, make_method
-from eddies.workflows.variants import rollouts
 
-STEP, MOMENTS = TimeStep("corrected-verlet", 0.05), 6
+STEP, MOMENTS, TESTS, STEADY = TimeStep("corrected-verlet", 0.05), 6, (4, 5), "density-constant"
 CELLS = 12  # of the grid on which errors are averaged: 2.4 particles a cell
 OUTPUT = Path(__file__).parents[1] / "results" / "ladder-oracles.json"
 Density = Callable[[float, ParticleSet], np.ndarray]
@@ -128,30 +127,31 @@ def two_errors(scene: Scene, directory: Path, truth: GroundTruth) -> dict[str, f
     return {"acceleration_error": float(np.mean(errors)), "compressive_share": float(np.mean(shares))}
 
 
-def main(directory: Path) -> None:
-    scene, found = load_scene(directory / "scene.toml"), {"density": {}, "errors": {}}
-    for name, runs in rollouts(scene, directory).items():
-        tests = {path: own for path, own in list(runs.items())[1:] if (path / "model.h5").exists()}
-        if not tests:
-            continue
-        rows, oracles = [], {}
-        for path, own in tests.items():
-            with open_truth(MPI.COMM_SELF, path / "ground_truth.h5") as truth:
-                rows.append(two_errors(own, path, truth))
-                if name == "density-constant":
-                    for case, made in (("own", None), ("at the places", AtPlaces), ("of the particles", OfParticles)):
-                        density = made and made(truth)
-                        oracles.setdefault(case, []).append(rollout(own, path, truth, density))
-        found["errors"][name] = rows
-        found["density"] |= oracles
-        print(name, {key: round(float(np.mean([row[key] for row in rows])), 4) for key in rows[0]}, flush=True)
-        for case, each in oracles.items():
-            print("   density", case, {key: round(float(np.mean([row[key] for row in each])), 3)
-                                       for key in each[0] if all(key in row for row in each)}, flush=True)
+def main(ladder: Path, runs: list[Path]) -> None:
+    found: dict[str, dict] = {"errors": {}, "density": {}}
+    tests = [ladder / f"realisation-{seed}" / "ground_truth.h5" for seed in TESTS]
+    models = {(run, name): own for run in [ladder, *runs]
+              for name, own in load_scene(run / "scene.toml").variant.items() if (run / name / "model.h5").exists()}
+    for path in tests:
+        with open_truth(MPI.COMM_SELF, path) as truth:
+            for (run, name), own in models.items():
+                rows = found["errors"].setdefault(run.name, {}).setdefault(name, [])
+                rows.append(two_errors(own, run / name, truth))
+            if (ladder, STEADY) in models:
+                for case, made in (("own", None), ("at the places", AtPlaces), ("of the particles", OfParticles)):
+                    row = rollout(models[ladder, STEADY], ladder / STEADY, truth, made and made(truth))
+                    found["density"].setdefault(case, []).append(row)
     OUTPUT.write_text(json.dumps(found, indent=1) + "\n")
+    for of, rows in [*found["errors"].items(), ("density", found["density"])]:
+        for name, each in rows.items():
+            means = {key: round(float(np.mean([row[key] for row in each])), 4)
+                     for key in each[0] if all(key in row for row in each)}
+            print(f"{of}, {name}: {means}")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path)
-    main(parser.parse_args().run)
+    parser.add_argument("ladder", type=Path)
+    parser.add_argument("runs", type=Path, nargs="*", help="further runs with trained variants, such as runs/networks")
+    given = parser.parse_args()
+    main(given.ladder, given.runs)

@@ -3,7 +3,7 @@
     .venv/bin/python docs/ladder/table.py runs/ladder
 
 The first realisation serves the choice, the others the test, whose mean and standard deviation stand in the table. It
-also writes results/ladder.json.
+also writes ../results/ladder.json and the figure ../paper/ladder.png: error at T over the cost of a turnover.
 """
 
 import json
@@ -13,11 +13,14 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
+from eddies.report.figures import GUIDE, LOOKS, panels, png, styled
 from eddies.scene.scene import load_scene
 from eddies.workflows.measure import is_current, read
 from eddies.workflows.variants import rollouts
 
 HERE = Path(__file__).parent
+#: The rungs that the line of the figure connects.
+LINE = "paper", "wide", "together", "together-horizons", "local-pairs", "local", "resolved"
 COLUMNS = {"acceleration_error": "a priori", "velocity_error_early": "t_η", "velocity_error_half": "T/2",
            "velocity_error_end": "T", "plane_difference": "field at T", "energy_ratio": "energy",
            "spectrum_error": "spectrum", "count_variance": "counts"}
@@ -38,6 +41,29 @@ def cell(values: list[float | None]) -> str:
     return f"{np.mean(known):.3g}" + (f" ± {np.std(known, ddof=1):.1g}" if len(known) > 1 else "")
 
 
+@styled
+def figure(found: dict[str, dict]):
+    """Velocity error at T over seconds a turnover: mean and standard deviation of the flows of the test."""
+    drawn, axes = panels(1, 1, (7.0, 4.4))
+    axis, points = axes[0, 0], {}
+    for name, row in found.items():
+        errors = [other["velocity_error_end"] for other in row["realisations"][1:]]
+        if None not in errors and row["wall_seconds"]:
+            points[name] = row["wall_seconds"], float(np.mean(errors)), float(np.std(errors, ddof=1))
+    line = [name for name in LINE if name in points]
+    axis.plot(*np.transpose([points[name][:2] for name in line]), color=GUIDE, linewidth=1, zorder=1)
+    for name, (cost, error, spread) in points.items():
+        colour, marker = LOOKS.get("none" if name == "no-force" else name, (GUIDE, "o"))
+        named = name in line or name in LOOKS
+        axis.errorbar(cost, error, spread, color=colour, marker=marker, markersize=6 if named else 4, linewidth=1)
+        if named:
+            axis.annotate(name, (cost, error), xytext=(6, 5), textcoords="offset points", fontsize=9)
+    axis.errorbar([], [], [], color=GUIDE, marker="o", markersize=4, linestyle="none", label="other rungs (table)")
+    axis.set(xscale="log", xlabel="seconds a turnover", ylabel="velocity error at T", ylim=(0, None))
+    axis.legend()
+    return drawn
+
+
 def main(directory: Path) -> None:
     rows = json.loads((directory / "report" / "metrics.json").read_text())["rows"]
     costs, found = {row["name"]: row for row in rows}, {}
@@ -46,6 +72,7 @@ def main(directory: Path) -> None:
             cost = {key: costs[name][key] for key in ("training_seconds", "time_step", "wall_seconds")}
             found[name] = cost | {"realisations": [measures_of(run) for run in runs]}
     (HERE.parent / "results" / "ladder.json").write_text(json.dumps(found, indent=1) + "\n")
+    (HERE.parent / "paper" / "ladder.png").write_bytes(png(figure(found)))
     print(f"| rung | training (s) | seconds a turnover | T, choice | {' | '.join(COLUMNS.values())} |")
     print("|---" * (4 + len(COLUMNS)) + "|")
     for name, row in found.items():
