@@ -1,6 +1,6 @@
 """Oracles of the ladder, from its run: the true density at each step, and two errors of one force. Takes minutes.
 
-    .venv/bin/python docs/ladder/oracles.py runs/ladder runs/networks
+    .venv/bin/python docs/ladder/oracles.py runs/ladder runs/choices
 
 The force of `density-constant`, which has no equation for the density, is evaluated with the true density at the places
 of the particles, or with that of the same particle in the truth. For all trained rungs the error of the acceleration at
@@ -152,6 +152,6 @@ def main(ladder: Path, runs: list[Path]) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("ladder", type=Path)
-    parser.add_argument("runs", type=Path, nargs="*", help="further runs with trained variants, such as runs/networks")
+    parser.add_argument("runs", type=Path, nargs="*", help="further runs with trained variants, such as runs/choices")
     given = parser.parse_args()
     main(given.ladder, given.runs)
