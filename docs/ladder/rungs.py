@@ -79,7 +79,7 @@ class Decay(eddies.Term):
 
     def forward(self, context) -> eddies.Rates:
         scales = context.flow.scales
-        excess = context.own_density - scales.density_mean
+        excess = context.density - scales.density_mean
         rate = 2 * scales.velocity / scales.filter_width * self.factor.to(excess)
         return eddies.Rates(density_rate=-rate * excess)
 
