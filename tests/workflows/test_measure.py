@@ -13,6 +13,7 @@ from eddies.stored_run import open_run
 from eddies.workflows import measure
 from eddies.workflows.measure import AXES
 from eddies.workflows.rollout import particle_measures
+from eddies.workflows.rollout.measured import open_rollout
 from tests.changed_product import changed
 from tests.workflows.synthetic_run import write_kernel, write_rollout, write_run
 
@@ -153,7 +154,7 @@ def test_a_variant_has_measures_beside_its_rollout(comm, directory):
 @pytest.mark.mpi(1)
 def test_a_rollout_without_its_ground_truth_or_with_positions_that_are_not_finite(comm, directory):
     with changed(directory / "rollout.h5") as file:
-        file["particles/model/velocity/value"][4:] = np.nan
+        file["particles/model/position/value"][4:, 0] = np.nan
     numbers, tables = measured(directory, comm)
     assert not numbers["rollout"]["stable"] and len(tables["model"]["time"]) == 4
     assert numbers["rollout"]["broken"] == pytest.approx(0.4 / 1.2)
@@ -177,4 +178,12 @@ def test_solves_that_do_not_converge_are_logged_once_and_frames_that_cannot_be_r
             file["particles/tracers/position/value"][7] = np.nan
     comm.Barrier()
     with pytest.raises(ProductError, match="position/value, frame 7: holds values that are not finite"):
+        measure.run(directory, comm)
+
+
+@pytest.mark.mpi(2, timeout=60)
+def test_a_product_that_one_rank_cannot_open_ends_all_ranks(comm, directory, monkeypatch):
+    if comm.rank == 1:
+        monkeypatch.setattr(measure, "open_rollout", lambda where, alone: open_rollout(where / "hidden", alone))
+    with pytest.raises(ProductError, match="hidden/rollout.h5: no such file"):
         measure.run(directory, comm)

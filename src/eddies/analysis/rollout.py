@@ -134,9 +134,11 @@ class Rollout:
 
     @cached_property
     def broken(self) -> float:
-        """Time of the first frame with a velocity or acceleration that is not finite; infinity if there is none."""
+        """Time of the first frame with a position, velocity or acceleration that is not finite; infinity if there is
+        none."""
+        columns = "position", "velocity", "acceleration"
         for frame, time in enumerate(self.model.times):
-            if not all(np.isfinite(self.model.read(frame, column)).all() for column in ("velocity", "acceleration")):
+            if not all(np.isfinite(self.model.read(frame, column)).all() for column in columns):
                 return float(time)
         return np.inf
 

@@ -2,6 +2,7 @@
 
 import json
 import logging
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,8 @@ def run(directory: Path, comm: Comm, kept: dict[Path, Measures] | None = None) -
     """
     alone = comm.Split(comm.rank)
     try:
-        with on_all_ranks(comm, lambda: open_rollout(directory, alone), ProductError) as opened:
+        with ExitStack() as files:
+            opened = on_all_ranks(comm, lambda: files.enter_context(open_rollout(directory, alone)), ProductError)
             if opened.solver is not None:
                 _measure_frames(opened, comm)
             in_files(comm, directory, lambda: _write(directory, opened, alone, comm.size, kept))
@@ -95,7 +97,7 @@ def _measure_frames(opened: StoredRollout, comm: Comm) -> None:
         return Invariants.of(fields.gradients(frame)) if quantity == "invariants" else fields.plane(frame)
 
     prepare_torch("cpu", comm)
-    tasks = on_all_ranks(comm, lambda: _tasks(opened), ProductError)
+    tasks = on_first_rank(comm, lambda: _tasks(opened))
     own = on_all_ranks(comm, lambda: {task: measured(*task) for task in tasks[comm.rank::comm.size]}, ProductError)
     for part in comm.gather(own) or []:
         for (quantity, of, frame), value in part.items():
@@ -128,7 +130,7 @@ def _write(directory: Path, opened: StoredRollout, alone: Comm, ranks: int, kept
     rollout = opened.rollout
     try:
         numbers, tables = measures(rollout, opened.stationary)
-    except (ValueError, OverflowError) as error:  # NaN or infinity in positions, of which there is no PDF
+    except (ValueError, OverflowError) as error:  # too few particles, or values of which there is no PDF
         numbers, tables = {"rollout": of_model(rollout), "accuracy": dict.fromkeys([*MEASURES, "end"]),
                            "not_compared": str(error)}, {}
     numbers |= {"attributes": rollout.attributes, "ranks": opened.provenance["ranks"],
