@@ -81,7 +81,9 @@ def test_missing_and_wrong_kind(comm, tmp_path):
 @pytest.mark.mpi(1)
 def test_another_format_is_refused(comm, tmp_path):
     """A later version stores another number, and eddies 0.1.0 stored none."""
-    for kind, number, remedy in (("ground_truth", None, "run `eddies dns` again"), ("frames", 4, "make it again")):
+    for kind, number, remedy in (("ground_truth", None, "run `eddies dns` again"),
+                                 ("measures", None, "run `eddies measure` on its directory again"),
+                                 ("frames", 4, "make it again")):
         path = write(comm, tmp_path / "a.h5", kind)
         assert product_fingerprint(path) == "abc"
         with changed(path) as file:

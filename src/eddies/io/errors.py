@@ -73,4 +73,6 @@ def read_errors(path: Path | str) -> Iterator[None]:
 def remedy_for(kind: str, file: str = "it") -> str:
     """Return the remedy, in words, for a product of this `kind` that cannot be used. The stage that makes such a
     product keeps an existing file, so the user has to remove it. `file` is the text that names the file."""
+    if kind == "measures":
+        return "run `eddies measure` on its directory again"
     return f"remove {file} and run `eddies {MAKER_OF[kind].name}` again" if kind in MAKER_OF else "make it again"
