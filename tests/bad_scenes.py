@@ -58,6 +58,8 @@ BAD_TEXTS = [
     (HEAD + "[variant.a]\nsimulation.turnovers = 0.1\n", "[simulation] turnovers = 0.1 where the scene has 0.25"),
     (HEAD + "[variant.a]\nkernel.form = 'average'\n", '[kernel] form = "average" where the scene has "kriging"'),
     (HEAD + "[variant.a]\ntraining.window = 0.4\n", "[training] window = 0.4 where the scene has 0.5"),
+    (HEAD + "[variant.a]\nlabel = 'b'\n[variant.b]\n", 'variant "a": label = "b": another variant has it too'),
+    (HEAD + "label = 'c'\n[variant.a]\n[variant.b]\n", 'variant "a": label = "c": another variant has it too'),
     (HEAD + "[varaint.a]\n", "[varaint]: no such section; did you mean variant?"),
     ('bas = "tiny"\n', "bas: no such key; did you mean base?"),
     (HEAD + "realisations = [3, 1]\n", "realisations = [3, 1]: 1 is the seed of the scene"),

@@ -257,6 +257,9 @@ class Scene(Section):
         variant = self.variant[name]
         if problem := checks.problem_of_name(name):
             yield problem
+        elif (label := getattr(variant, "label", None)) in [
+                getattr(self.variant[other], "label", None) or other for other in self.variant if other != name]:
+            yield f"label = {quoted(label)}: another variant has it too; choose another, or remove it"
         elif not isinstance(variant, Scene) or variant.variant or variant.realisations:
             yield "must be a scene without variants and realisations of its own"
         elif variant.sets:
