@@ -12,8 +12,10 @@ from mpi4py import MPI
 
 from eddies import cli
 from eddies.io.errors import ProductError, WriteError
+from eddies.io.hdf5 import create_product, write_table
 from eddies.measures import MEASURES
 from eddies.parallel.stop import Stopped
+from eddies.report import steps
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import dns, measure, report
 from eddies.workflows.diff import numbers_of
@@ -252,6 +254,20 @@ def test_a_report_elsewhere_needs_no_place_for_measures(comm, tmp_path, monkeypa
     comm.Barrier()
     found = json.loads((tmp_path / "elsewhere/metrics.json").read_text())["rollouts"]
     assert found[tmp_path.name]["turnovers"] == pytest.approx(0.8 / 1.2) and not (tmp_path / "measures.h5").exists()
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_the_search_for_a_step_is_that_of_the_variant_whose_realisations_use_it(comm, tmp_path):
+    (tmp_path / "scene.toml").write_text(scene_of(tmp_path, head="realisations = [5]\n").to_toml())
+    (tmp_path / "plain/realisation-5").mkdir(parents=True)
+    write_kernel(comm, tmp_path)
+    columns = dict.fromkeys(("size", "error", "difference", "seconds_per_turnover"), [0.1, 0.05])
+    with create_product(comm, tmp_path / "plain/step.h5", "step", {}) as file:
+        file.create_group("found").attrs.update(dict.fromkeys(steps.CHOSEN, 0.05) | {
+            "integrator": "verlet", "turnovers": 0.2, "tolerance": 0.02, "difference": 0.01})
+        write_table(file, "trials/verlet", columns)
+    report.run(tmp_path, comm)
+    assert json.loads((tmp_path / "report/metrics.json").read_text())["steps"]["plain"]["size"] == 0.05
 
 
 @pytest.mark.usefixtures("no_figures")

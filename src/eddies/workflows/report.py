@@ -178,7 +178,7 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: S
     for problem in directory_problems(("report",), comm, directory) if output is None else ():
         raise SceneError(problem)
     report = in_files(comm, directory, lambda: Report.of(directory, variants))
-    for where in report.rollouts:
+    for where in in_files(comm, directory, lambda: report.rollouts):
         _measure().update(where, comm, None if output is None else report.kept)
         stop.check()
     stop.check()
@@ -267,11 +267,12 @@ def _add_learned(report: Report, alone: Comm) -> None:
     """Add sections on the models and the steps of the variants."""
     trained: dict[str, Variant] = {}
     searches: dict[str, Variant] = {}
+    realised = report.scene is not None and report.scene.realisations is not None
     for name, (where, *_) in report.variants.items():
         with report.opened(where, "model", alone) as file:
             if file is not None:
                 trained[name] = report.variant(name, *_model(file))
-        with report.opened(where, "step", alone) as file:
+        with report.opened(where.parent if realised else where, "step", alone) as file:
             if file is not None:
                 searches[name] = report.variant(name, read_attributes(file, "found"), {
                     method: read_table(file, f"trials/{method}") for method in file["trials"]})
