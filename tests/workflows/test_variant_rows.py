@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from eddies.analysis.pareto import break_even
 from eddies.io.hdf5 import create_product, write_table
@@ -11,7 +12,7 @@ from eddies.io.weights import save_weights
 from eddies.measures import MEASURES
 from eddies.scene.scene import load_scene
 from eddies.workflows.variant_rows import (BEFORE, BREAK_EVEN, SEARCH, THROUGH_KERNEL, add_break_even, before, combined,
-                                           missing_reason, notes, numbers, rows_of, simulation_seconds)
+                                           machine, missing_reason, notes, numbers, rows_of, simulation_seconds)
 from tests.small_scene import TINY
 
 HEAD = f'base = "{TINY}"\nsimulation.turnovers = 0.25\nkernel.steps = 50\n'
@@ -70,6 +71,11 @@ def test_a_turnover_costs_as_much_as_its_steps():
     assert (found["stopped_at"], found["velocity_kl"]) == (None, 0.5)
     stopped = numbers({"attributes": {"status": "stopped: here", "turnovers": 0.3}, "ranks": 3, "accuracy": {}})
     assert stopped == {"status": "stopped: here", "ranks": 3, "stopped_at": 0.3, "time_step": None}
+
+
+def test_a_report_on_a_run_on_gpus_needs_none(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert machine("cuda", 2)["device"] == "cuda" and machine("cpu", 2)["ranks"] == 2
 
 
 def test_a_note_says_how_many_flows_the_numbers_are_of():

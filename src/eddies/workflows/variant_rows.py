@@ -210,7 +210,8 @@ def machine(device: str, ranks: int) -> dict[str, Any]:
     """Return what the times depend on: processor, cores, ranks, threads, device, versions of libraries."""
     if device == "cuda":
         import torch
-        device = torch.cuda.get_device_name()
+        if torch.cuda.is_available():  # the report may be made on another machine
+            device = torch.cuda.get_device_name()
     return {"processor": processor(), "cores": os.cpu_count(), "threads_per_rank": threads(), "device": device,
             **environment(ranks)}
 
