@@ -238,6 +238,17 @@ def test_a_rollout_without_its_ground_truth(comm, tmp_path):
 
 
 @pytest.mark.usefixtures("no_figures")
+@pytest.mark.parametrize("overrides, removals", [([], ["simulation"]), (["tracers.a.particles_per_side=6"], [])],
+                         ids=["no rollout", "sets"])
+def test_a_rollout_of_an_earlier_scene_is_shown_if_the_scene_asks_for_none(comm, tmp_path, overrides, removals):
+    (tmp_path / "scene.toml").write_text(one_model("tiny", overrides, removals).to_toml())
+    write_rollout(comm, tmp_path)
+    report.run(tmp_path, comm)
+    metrics = written(tmp_path)[0]
+    assert metrics["rollouts"]["turnovers"] > 0 and not metrics["row"]
+
+
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1, 2)
 def test_a_report_elsewhere_needs_no_place_for_measures(comm, tmp_path, monkeypatch):
     """As of a run of an earlier version in a directory that cannot be written."""

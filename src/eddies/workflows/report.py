@@ -123,6 +123,12 @@ class Report:
         """The directory whose products the page describes: that of the first variant shown."""
         return self.variants[self.shown[0]][0] if self.shown else self.directory
 
+    @property
+    def asked_for(self) -> bool:
+        """Whether the scene asks for the rollouts. If not, they are those of an earlier scene."""
+        return self.scene is not None and self.scene.simulation is not None and bool(
+            self.scene.variant or not self.scene.sets)
+
     def scene_of(self, name: str) -> Scene | None:
         """Return the scene of a variant."""
         return self.scene and self.scene.variant.get(name, self.scene)
@@ -213,7 +219,7 @@ def _make(report: Report, ranks: int, alone: Comm) -> None:
     if not report.provenance:
         raise ProductError(f"{report.directory}: holds none of {', '.join(stage.file for stage in MAKER_OF.values())}; "
                            "run `eddies dns SCENE` first")
-    if report.scene is not None and found:
+    if report.asked_for and found:
         report.sections.append(_compare(report, measures, shared[0].numbers.get(SIMULATION), ranks, alone))
     if found:
         drawn = report.first(found)
