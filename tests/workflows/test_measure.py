@@ -14,6 +14,7 @@ from eddies.workflows import measure
 from eddies.workflows.measure import AXES
 from eddies.workflows.rollout import particle_measures
 from eddies.workflows.rollout.measured import open_rollout
+from eddies.workflows.train_kernel import keep_form
 from tests.changed_product import changed
 from tests.workflows.synthetic_run import write_kernel, write_rollout, write_run
 
@@ -128,7 +129,9 @@ def test_measures_are_made_again_when_a_product_changes(comm, directory):
     with open_product(comm, path, "measures") as file:
         assert {"numbers", "provenance"} <= set(file.attrs)
     for change in (lambda: write_rollout(comm, directory, frames=5, status="stopped: here"),
-                   lambda: write_kernel(comm, directory, seed=2), (directory / "kernel.h5").unlink):
+                   lambda: write_kernel(comm, directory, seed=2),
+                   lambda: keep_form(comm, directory / "kernel.h5", "kriging", {}),  # the file keeps its id
+                   (directory / "kernel.h5").unlink):
         change()
         assert not measure.is_current(directory)
         measure.update(directory, comm)

@@ -14,7 +14,7 @@ from eddies.analysis.velocity_gradients import Invariants
 from eddies.io.errors import ProductError, WriteError
 from eddies.io.hdf5 import Table, create_product, in_files, open_product, read_table, write_table
 from eddies.io.new_files import set_attributes
-from eddies.io.provenance import product_ids, product_provenance, read_json
+from eddies.io.provenance import product_attributes, product_ids, product_provenance, read_json
 from eddies.measures import MEASURES
 from eddies.parallel.broadcast import on_all_ranks, on_first_rank
 from eddies.parallel.communicator import Comm
@@ -69,9 +69,11 @@ def update(directory: Path, comm: Comm, kept: dict[Path, Measures] | None = None
 
 
 def is_current(directory: Path) -> bool:
-    """Return whether measures.h5 was made from the rollout, the ground truth and the kernel beside it."""
-    made_from = product_provenance(directory / FILE).get("made_from")
-    return made_from is not None and made_from == product_ids(directory, MADE_FROM)
+    """Return whether measures.h5 was made from the rollout, the ground truth and the kernel beside it, and by the form
+    of this kernel."""
+    origin = product_provenance(directory / FILE)
+    return bool(origin) and origin["made_from"] == product_ids(directory, MADE_FROM) and (
+        origin.get("kernel") == _kernel(directory))
 
 
 def read(directory: Path, alone: Comm) -> Measures:
@@ -83,6 +85,12 @@ def read(directory: Path, alone: Comm) -> Measures:
     """
     with open_product(alone, directory / FILE, "measures") as file:
         return read_json(file, "numbers"), {name: read_table(file, name) for name in file}
+
+
+def _kernel(directory: Path) -> str | None:
+    """Return the description in kernel.h5, which names its form; None without a kernel. The id of the file does not
+    tell another form (`train_kernel.keep_form`)."""
+    return product_attributes(directory / FILE_OF["kernel"], "/").get("description")
 
 
 def _measure_frames(opened: StoredRollout, comm: Comm) -> None:
@@ -136,7 +144,8 @@ def _write(directory: Path, opened: StoredRollout, alone: Comm, ranks: int, kept
     numbers |= {"attributes": rollout.attributes, "ranks": opened.provenance["ranks"],
                 "reconstructed_by": rollout.reconstructed_by, "filter_width": rollout.reference.get("filter_width"),
                 "truth": product_ids(directory, ("ground_truth",)).get("ground_truth")}
-    origin = {"scene": opened.provenance.get("scene", ""), "made_from": MADE_FROM, "ranks": ranks}
+    origin = {"scene": opened.provenance.get("scene", ""), "made_from": MADE_FROM, "kernel": _kernel(directory),
+              "ranks": ranks}
     text = json.dumps(numbers, default=np.ndarray.tolist)
     try:
         with create_product(alone, directory / FILE, "measures", origin) as file:
