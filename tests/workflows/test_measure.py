@@ -34,7 +34,7 @@ def measured(directory, comm):
     return found
 
 
-@pytest.mark.mpi(2, 3)
+@pytest.mark.mpi(3)
 def test_ranks_that_share_the_work_find_what_one_finds(comm, directory):
     numbers, tables = measured(directory, comm)
     if comm.rank == 0:

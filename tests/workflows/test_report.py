@@ -25,7 +25,7 @@ from tests.workflows.stopping import StopAtStep
 from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_model, write_rollout, write_run
 from tests.workflows.test_variant_rows import scene_of
 
-pytestmark = pytest.mark.mpi(1)
+pytestmark = [pytest.mark.mpi(1), pytest.mark.usefixtures("quick_spectra")]
 
 FIGURES = {
     "statistics", "spectra", "fields", "stationary", "tracers", "figure-1-kernels", "figure-2-reconstruction",
