@@ -120,7 +120,7 @@ def test_memory_finds_scales_of_an_unfiltered_flow_that_one_frame_does_not_deter
     assert errors["memory"] < 0.6 * errors["least-squares"]
 
 
-@pytest.mark.mpi(3)
+@pytest.mark.mpi(2)
 def test_fields_do_not_depend_on_the_number_of_ranks(comm, flow, tmp_path, linked):
     keys = {"method": "memory", "every": 3, "fields": ("velocity",)}
     errors, _ = errors_of(comm, flow, tmp_path, linked, **keys)
