@@ -16,6 +16,8 @@ from eddies.workflows.rollout import particle_measures
 from tests.changed_product import changed
 from tests.workflows.synthetic_run import write_kernel, write_rollout, write_run
 
+pytestmark = pytest.mark.usefixtures("quick_spectra")
+
 
 @pytest.fixture
 def directory(comm, tmp_path):
