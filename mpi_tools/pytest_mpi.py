@@ -22,7 +22,7 @@ import pytest
 
 RANKS = {1, 2, 3}  # on which test.sh runs tests
 TIMEOUT = 120      # seconds for one test
-GRACE = 5          # seconds in which all ranks print their stacks, after the time limit
+GRACE = 2          # seconds in which all ranks print their stacks, after the time limit
 
 
 @pytest.hookimpl(trylast=True)  # after the terminal reporter is made

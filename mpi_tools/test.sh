@@ -8,6 +8,8 @@ bash mpi_tools/bootstrap.sh
 export OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
 # A rank that waits yields its core.
 export OMPI_MCA_mpi_yield_when_idle=1
+# Ranks of one machine need no network, for which Open MPI would search at each start, and single ones no daemon.
+export OMPI_MCA_pml=${OMPI_MCA_pml:-ob1} OMPI_MCA_ess_singleton_isolated=1
 # Compiled modules are stored. Otherwise each of the hundreds of processes of the tests would compile them again.
 unset PYTHONDONTWRITEBYTECODE
 failed=0

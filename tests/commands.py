@@ -10,6 +10,8 @@ from pathlib import Path
 from mpi_tools.launch import mpi_environment, mpirun_command
 
 LAUNCHER = Path(__file__).parents[1] / "mpi_tools/launch.py"
+#: A direct simulation of a few milliseconds a step that does not end by itself.
+ENDLESS = ["-m", "eddies", "dns", "abc", "--set", "time.duration=1e6"]
 
 
 def run_cli(*arguments):
@@ -64,8 +66,8 @@ def launched(ranks, *arguments):
 
 @contextlib.contextmanager
 def a_simulation(directory, ranks=1):
-    """A running direct simulation."""
-    command = ["-u", "-m", "eddies", "dns", "hit-small", "--output", directory]
+    """The simulation ENDLESS, running."""
+    command = ["-u", *ENDLESS, "--output", directory]
     line = [sys.executable, *(launched(ranks, *command) if ranks > 1 else command)]
     # A shell's background job ignores the interrupt, and its children inherit that.
     job = subprocess.Popen(list(map(str, line)), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,

@@ -4,10 +4,19 @@ import importlib
 import logging
 import os
 import sys
+from types import SimpleNamespace
 
 import pytest
 
 pytest_plugins = ["mpi_tools.pytest_mpi"]
+
+
+@pytest.fixture(autouse=True, scope="session")
+def no_waiting_for_the_disk():
+    """Products are not forced to the disk, which takes ten milliseconds for each."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda descriptor: None)
+        yield
 
 
 @pytest.fixture(autouse=True)
@@ -44,6 +53,13 @@ def quick_spectra(monkeypatch):
     """Three iterations for each spectrum of particles, for tests in which its accuracy does not matter."""
     from eddies.workflows.rollout import particle_measures
     monkeypatch.setattr(particle_measures, "MOST_ITERATIONS", 3)
+
+
+@pytest.fixture
+def unmeasured(monkeypatch):
+    """Do not measure a rollout at its end, for tests of the rollouts themselves. A report measures it then."""
+    from eddies.workflows import simulate
+    monkeypatch.setattr(simulate, "measure", SimpleNamespace(run=lambda directory, comm: None))
 
 
 @pytest.fixture

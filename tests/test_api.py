@@ -71,7 +71,8 @@ def test_a_scene_that_a_program_makes_and_names_a_run_directory(comm, tmp_path, 
 
 def test_an_error_that_one_rank_meets_ends_the_job(tmp_path):
     program = tmp_path / "program.py"
-    program.write_text("import eddies, eddies.api\nfrom mpi4py import MPI\n"
+    program.write_text("import eddies, eddies.api, eddies.parallel.broadcast\nfrom mpi4py import MPI\n"
+                       "eddies.parallel.broadcast.PATIENCE = 0.5\n"
                        "def fail(scene, comm):\n    if comm.rank == 1:\n        raise RuntimeError('lost')\n"
                        "    comm.Barrier()\n"
                        "import eddies.workflows.check\neddies.workflows.check.run = fail\neddies.check('abc')\n")

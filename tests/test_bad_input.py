@@ -109,12 +109,11 @@ def test_a_rank_may_have_one_particle_or_none(comm, tmp_path):
 
 
 def as_nobody(commands, built_in):
-    """Exit codes and errors of commands of a user without rights of root, who may not read this checkout: all modules
+    """Exit codes and errors of commands of a user without rights of root, who may not read this checkout: their modules
     are loaded before, and the folder of the built-in scenes is another."""
-    code = ("import encodings.utf_8_sig, importlib, json, os, pathlib, pkgutil, sys, numpy.random, eddies.cli\n"
-            "names = [found.name for found in pkgutil.walk_packages(eddies.__path__, 'eddies.')]\n"
-            "others = '__main__', 'avx2', 'avx512', 'plain'  # a command, and libraries that are no modules\n"
-            "[importlib.import_module(name) for name in names if name.split('.')[-1] not in others]\n"
+    code = ("import encodings.utf_8_sig, importlib, json, os, pathlib, sys, numpy.random\n"
+            "import eddies.cli, eddies.stages, eddies.stored_run\n"
+            "[importlib.import_module(f'eddies.workflows.{command[0]}') for command in json.loads(sys.argv[1])]\n"
             "eddies.kernels.library.library()\n"
             "eddies.scene.layers.BUILT_IN = pathlib.Path(sys.argv[2])\n"
             f"os.getuid() or (os.setgroups([]), os.setgid({NOBODY}), os.setuid({NOBODY}))\n"

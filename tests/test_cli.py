@@ -12,7 +12,7 @@ import pytest
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from tests.bad_scenes import BAD_OVERRIDES, BAD_TEXTS
-from tests.commands import a_simulation, first_rank, launched, python, refused, run_cli, set_all
+from tests.commands import ENDLESS, a_simulation, first_rank, launched, python, refused, run_cli, set_all
 from tests.small_scene import TINY
 
 ABC = ["abc", "--set", "time.duration=0.1"]
@@ -233,7 +233,7 @@ def test_a_signal_ends_the_job_to_be_resumed(tmp_path, number, after):
 
 def test_a_second_job_is_refused(tmp_path):
     """Both jobs have two ranks, and the first one goes on. Its lock ends with it, even if it is killed."""
-    line = launched(2, "-m", "eddies", "dns", "hit-small", "--output", tmp_path / "run", "--max-minutes", "0.02")
+    line = launched(2, *ENDLESS, "--output", tmp_path / "run", "--max-minutes", "0.02")
     with a_simulation(tmp_path / "run", ranks=2) as first:
         begun = (tmp_path / "run/LOCK").read_bytes()
         assert python("-m", "eddies", "status", tmp_path).stdout.count(f"in use by {begun.decode()}") == 1

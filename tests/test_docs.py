@@ -334,7 +334,7 @@ def test_links_and_files_of_a_page_exist(page):
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("program", [code for code in blocks("python") if "runs/hit-small" in code],
                          ids=["h5py", "open_run", "read_tracks"])
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("undrawn", "quick_spectra")
 def test_python_runs_on_the_files_of_a_run(comm, tmp_path, monkeypatch, capsys, program):
     from eddies.workflows import report
     from tests.left_out import leave_out_figures

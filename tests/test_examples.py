@@ -34,7 +34,7 @@ def results(directory):
 
 
 @pytest.fixture
-def smaller(tmp_path, monkeypatch, no_figures, quick_solves):
+def smaller(tmp_path, monkeypatch, no_figures, quick_solves, quick_spectra):
     """The working directory, in which scenes are smaller."""
     load = eddies.load_scene
     monkeypatch.setattr(eddies, "load_scene", lambda name, overrides, removals=(): load(

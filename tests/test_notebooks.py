@@ -14,7 +14,7 @@ from eddies.analysis.pareto import pareto_front
 from mpi_tools.launch import mpi_environment
 
 NOTEBOOKS = Path(__file__).parents[1] / "docs" / "notebooks"
-SMALLER = ["spin_up.turnovers=0.3", "tracers.particles_per_side=8", "tracers.field_cells=12",
+SMALLER = ["flow.cells=16", "spin_up.turnovers=0.2", "tracers.particles_per_side=8", "tracers.field_cells=12",
            "tracers.turnovers=0.3", "kernel.neighbors=30", "kernel.steps=4", "kernel.points=50"]
 NO_SEARCH = "simulation.step=0.1"
 TRAINED_LESS = ["training.steps=8", "training.combined_steps=2", "training.frames=2", "training.batch=64"]
@@ -114,7 +114,7 @@ def test_a_term_of_ones_own(execute, folder):
 
 
 def test_another_flow(execute):
-    cells, table = execute("another-flow", "table", changes=[*SMALLER, "flow.cells=24", "simulation.turnovers=0.06"])
+    cells, table = execute("another-flow", "table", changes=[*SMALLER, "simulation.turnovers=0.06"])
     assert set(figures(cells)) == {"figure"} and len(table) == 2
     for errors in table.values():
         assert 0 < errors["acceleration"] < errors["pressure gradient"] < 1.5

@@ -39,6 +39,7 @@ def test_groups_are_datasets_that_are_read_on_access(directory):
 
 
 @pytest.mark.mpi(1)
+@pytest.mark.usefixtures("quick_spectra")
 def test_all_groups_can_be_pickled(directory, monkeypatch):
     """Also for a process with another working directory."""
     monkeypatch.chdir(directory)
@@ -87,7 +88,7 @@ def test_a_scalar_field_has_no_components(comm, tmp_path):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("undrawn", "quick_spectra")
 def test_figures_are_those_of_the_report(comm, directory, monkeypatch):
     from eddies.workflows import report
     with monkeypatch.context() as patch:

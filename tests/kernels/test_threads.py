@@ -3,8 +3,6 @@
 import hashlib
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +12,7 @@ from eddies.kernels.copies import ColumnCopies, Described, PlaneCopies
 from eddies.kernels.kriging import kriging_weights
 from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand
 from eddies.kernels.splines import Splines
+from tests.commands import python
 from tests.kernels import test_flow as flow
 from tests.kernels import test_modes as modes
 from tests.kernels.test_copies import noise
@@ -112,8 +111,7 @@ def digests():
 
 def test_the_same_bits_with_any_number_of_threads_and_from_run_to_run():
     """In processes of 1, 3 and again 3 threads."""
-    first, *others = (json.loads(subprocess.run(
-        [sys.executable, "-c", PROGRAM], cwd=CHECKOUT, timeout=120, check=True, capture_output=True, text=True,
-        env={**os.environ, "OMP_NUM_THREADS": threads}).stdout) for threads in ("1", "3", "3"))
+    first, *others = (json.loads(python("-c", PROGRAM, cwd=CHECKOUT, timeout=120, env={
+        **os.environ, "OMP_NUM_THREADS": threads}).stdout) for threads in ("1", "3", "3"))
     assert len(first) == len(KERNELS) * len(library.instruction_sets())
     assert all(digests == first for digests in others)

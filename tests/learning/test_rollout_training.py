@@ -81,7 +81,7 @@ def gradient_of(comm, horizon, **choices):
 
 
 @pytest.mark.parametrize("preset", ["resolved + pairs", OWN_DENSITY])
-@pytest.mark.mpi(2, 3)
+@pytest.mark.mpi(3)
 def test_gradient_is_the_same_on_any_number_of_ranks(comm, preset):
     loss, gradient = gradient_of(comm, FRAMES, preset=preset)
     alone, expected = comm.bcast(gradient_of(MPI.COMM_SELF, FRAMES, preset=preset) if comm.rank == 0 else None)

@@ -1,23 +1,15 @@
 """Environment, ranks and error output of the launcher, and the doctor under it."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mpi_tools import launch
+from tests.commands import launched, python
 from tests.small_scene import TINY
 
 CHECKOUT = Path(__file__).parents[2]
-
-
-def launched(ranks, *python_arguments, cwd=None):
-    """A finished Python on this many ranks."""
-    launch_line = [sys.executable, CHECKOUT / "mpi_tools/launch.py", "-n", str(ranks), "--"]
-    return subprocess.run([*launch_line, sys.executable, *python_arguments], cwd=cwd, timeout=120,
-                          capture_output=True, text=True)
 
 
 def test_ranks_are_the_cores_or_fewer(monkeypatch):
@@ -85,13 +77,13 @@ def test_a_line_that_is_not_ended_is_passed_on_at_once():
     (["-m", "eddies", "check", TINY, "--set", "flow.cels=3"], 2, "did you mean cells?"),
     (["-c", "raise SystemExit(2)"], 2, "non-zero"), (["-c", "raise SystemExit(75)"], 75, "")])
 def test_exit_code_is_that_of_the_ranks_and_a_refusal_is_one_line(arguments, code, words):
-    ended = launched(2, *arguments)
+    ended = python(*launched(2, *arguments))
     assert ended.returncode == code and words in ended.stderr
     assert "eddies" not in arguments or ended.stderr.count("\n") == 1
 
 
 def test_doctor_names_what_is_missing_and_leaves_no_file(tmp_path):
-    result = launched(2, CHECKOUT / "mpi_tools/doctor.py", cwd=tmp_path)
+    result = python(*launched(2, CHECKOUT / "mpi_tools/doctor.py"), cwd=tmp_path)
     assert result.returncode == 0, result.stdout + result.stderr
     assert "rank 0 of 2" in result.stdout and "rank 1 of 2" in result.stdout and "mpio" in result.stdout
     assert not list(tmp_path.iterdir())
@@ -100,6 +92,6 @@ def test_doctor_names_what_is_missing_and_leaves_no_file(tmp_path):
     # A third rank that MPI does not connect.
     code = (f"import os, sys, runpy; sys.path.insert(0, {str(tmp_path)!r}); os.environ['OMPI_COMM_WORLD_SIZE'] = '3'; "
             f"runpy.run_path({str(CHECKOUT / 'mpi_tools/doctor.py')!r}, run_name='__main__')")
-    result = launched(2, "-c", code, cwd=tmp_path)
+    result = python(*launched(2, "-c", code), cwd=tmp_path)
     assert result.returncode == 8  # four on each of two ranks
     assert "3 ranks were started" in result.stdout and "rank 1: pyfftw" in result.stdout

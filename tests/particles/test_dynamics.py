@@ -57,7 +57,7 @@ def test_rates_loss_and_gradients_do_not_depend_on_the_ranks(comm, name):
             assert np.abs(actual - reference).max() <= 1e-12 * max(np.abs(reference).max(), 1e-2)
 
 
-@pytest.mark.mpi(2, 3)
+@pytest.mark.mpi(3)
 @pytest.mark.parametrize("integrator, name", [("rk4", "corrected"), ("verlet", "pairs with density")])
 def test_gradients_through_several_steps_do_not_depend_on_the_ranks(comm, integrator, name):
     """Steps are long enough for particles to change rank and for lists to be rebuilt."""

@@ -16,6 +16,7 @@ from mpi4py import MPI
 import eddies.cli
 import eddies.io.checkpoint
 import eddies.io.hdf5
+import eddies.parallel.broadcast
 import eddies.parallel.halo
 import eddies.scene.scene
 import eddies.spectral.fourier_passes
@@ -55,6 +56,7 @@ def break_at(owner, name, call, kind, directory):
 
 def main():
     place, kind, directory = sys.argv[1], sys.argv[2], Path(sys.argv[3])
+    eddies.parallel.broadcast.PATIENCE = 0.5
     (directory / f"process-{MPI.COMM_WORLD.rank}").write_text(str(os.getpid()))
     if MPI.COMM_WORLD.rank == 1:
         break_at(*PLACES[place], kind, directory)

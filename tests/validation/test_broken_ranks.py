@@ -1,19 +1,15 @@
 """A rank that fails anywhere ends the job soon, with an exit code and its number, and leaves no product."""
 
-import os
 import re
-import subprocess
-import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from mpi_tools.launch import mpi_environment, mpirun_command
+from tests.commands import launched, on_ranks, python
 
 PROGRAM = Path(__file__).with_name("broken_rank.py")
-LAUNCHER = Path(__file__).parents[2] / "mpi_tools/launch.py"
 SECONDS = 10  # from the fault to the end of the job
 
 # Place, kind, ranks, and whether the launcher starts the job.
@@ -28,15 +24,10 @@ def jobs(tmp_path_factory):
         yield {case: pool.submit(break_job, *case, tmp_path_factory.mktemp("broken")) for case in CASES}
 
 
-def break_job(place, kind, ranks, launched, directory):
+def break_job(place, kind, ranks, by_launcher, directory):
     """Run the program; exit code, error output, seconds from the fault until the last process is gone, directory."""
-    command = [sys.executable, str(PROGRAM), place, kind, str(directory)]
-    environment = os.environ | {"OMPI_MCA_mpi_yield_when_idle": "1"}  # several jobs share the cores
-    if launched:
-        line = [sys.executable, str(LAUNCHER), "-n", str(ranks), "--", *command]
-    else:
-        line, environment = mpirun_command(ranks, command), mpi_environment(ranks) | environment
-    ended = subprocess.run(line, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=120)
+    program = PROGRAM, place, kind, directory
+    ended = python(*launched(ranks, *program)) if by_launcher else on_ranks(ranks, *program)
     broke = float((directory / "broke").read_text())
     processes = [file.read_text() for file in directory.glob("process-*")]
     while any(map(is_alive, processes)) and time.time() < broke + SECONDS:  # mpirun may end before a rank it killed

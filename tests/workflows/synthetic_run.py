@@ -1,5 +1,7 @@
 """Products of a synthetic run: random smooth fields and particles in the layout of the stages."""
 
+from functools import cache
+
 import numpy as np
 
 from eddies.io.fields import FieldWriter
@@ -45,11 +47,15 @@ class RandomFlow:
         interval = 1e-3
         return (self.velocity(position, time + interval) - self.velocity(position, time)) / interval
 
+    @cache
     def field(self, cells, time):
         x = LENGTH * np.arange(cells) / cells
         z, y, x = np.meshgrid(x, x, x, indexing="ij")
         position = np.stack([x, y, z], axis=-1).reshape(-1, 3)
         return self.velocity(position, time).T.reshape(3, cells, cells, cells)
+
+
+flow_of = cache(RandomFlow)  # by seed
 
 
 def provenance(*made_from, seed=1, forcing=""):
@@ -60,7 +66,7 @@ def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, statio
                        forced=False, total=600):
     """Write ground_truth.h5. Its frames of tracers include the times of the rollout if `frames` is 13. A `stationary`
     flow has a span for averages. A flow without `density` is incompressible."""
-    flow, origin = RandomFlow(seed), provenance(seed=seed, forcing='[forcing]\nwavenumber = 2.0\n' * stationary)
+    flow, origin = flow_of(seed), provenance(seed=seed, forcing='[forcing]\nwavenumber = 2.0\n' * stationary)
     with create_product(comm, directory / "ground_truth.h5", "ground_truth", origin) as file:
         time = np.linspace(0, 4, 81)
         wiggle = 1 + 0.1 * np.sin(3 * time)
@@ -94,10 +100,11 @@ def write_tracers(file, frames, density, total):
         writer.append(step, time, 0, particles(total, time - START))
 
 
+@cache
 def particles(total, time, growth=0.0):
     """All columns of particles that moved from random places with their present velocity, at a time since the start of
     the rollout. The velocity is that of the truth plus an error that grows linearly in time."""
-    truth, error = RandomFlow(1), RandomFlow(4)
+    truth, error = flow_of(1), flow_of(4)
     start = np.random.default_rng(5).uniform(0, LENGTH, (total, 3))
     velocity = truth.velocity(start, time) + growth * time * error.velocity(start, time)
     acceleration = truth.acceleration(start, time) + growth * time * error.acceleration(start, time)
@@ -119,7 +126,7 @@ def write_kernel(comm, directory, seed=1):
               "learned_no_gradient": np.exp(-9 * (r - 0.4) ** 2) * (1 - r),
               "cubic_spline": (1 - r) ** 3, "wendland": (1 - r) ** 4 * (1 + 4 * r)}
     kernels, slices, errors = {"r_over_h": r}, {}, {}
-    plane = RandomFlow(2).field(cells, 0.0)[0, cells // 2]
+    plane = flow_of(2).field(cells, 0.0)[0, cells // 2]
     truth = {"velocity": plane, "gradient": np.gradient(plane, LENGTH / cells, axis=1)}
     slices |= {f"truth_{quantity}": values for quantity, values in truth.items()}
     for index, (name, shape) in enumerate(shapes.items()):
@@ -187,7 +194,7 @@ def write_rollout(comm, directory, status="complete", total=600, frames=9, broke
         for step, time in enumerate(times):
             columns = particles(total, time, growth=0.4)
             if step == broken:
-                columns["velocity"] = np.full((total, 3), np.nan)
+                columns = columns | {"velocity": np.full((total, 3), np.nan)}
             writer.append(step, time, 0, columns)
 
 

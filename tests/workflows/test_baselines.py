@@ -15,7 +15,7 @@ from eddies.workflows.rollout.measured import open_rollout
 from tests.commands import first_rank
 from tests.workflows.small_rollout import prepared
 
-pytestmark = pytest.mark.usefixtures("quick_spectra")
+pytestmark = pytest.mark.usefixtures("unmeasured")
 
 SCENE = ["flow.cells=16", "flow.viscosity=0.05", "kernel.neighbors=30", "simulation.method=none",
          "simulation.turnovers=0.2"]

@@ -339,7 +339,7 @@ def test_a_run_without_tracers_continues(comm, tmp_path, last):
         dns.run(scene, comm, tmp_path)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_finished_run_goes_on_for_longer(comm, tmp_path, whole, caplog):
     run, expected = tmp_path, product(comm, whole)
     scene, short = (load_scene(TINY, [*SPLIT, *changes]) for changes in ([], ["tracers.turnovers=0.09"]))

@@ -75,7 +75,7 @@ def found_step(comm, scene, directory):
         return read_attributes(file, "found"), read_table(file, "trials/rk2")
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_the_step_is_the_longest_whose_half_changes_little_of_the_error(comm, small_products, linked, own_method):
     """The error of the method is a + b h, so that halving the step changes b h / 2. In a weaker flow the same error is
     a larger share, and the step must converge there too."""
@@ -132,8 +132,8 @@ def test_an_integrator_of_cheap_evaluations_is_tried_with_shorter_steps(comm):
     assert found.integrator == "cheap" and found[rung].step.size == 0.01
 
 
-@pytest.mark.mpi(1, 2)
-def test_a_rollout_takes_the_step_that_was_found(comm, small_products, linked):
+@pytest.mark.mpi(2)
+def test_a_rollout_takes_the_step_that_was_found(comm, small_products, linked, unmeasured):
     """Without a force any step is exact, so the first is taken: the whole of the short rollout."""
     scene, directory = searched(small_products[0]), linked(small_products[1])
     find_step.run(scene, comm, directory)

@@ -18,6 +18,8 @@ from eddies.workflows.train_kernel import keep_form
 from tests.changed_product import changed
 from tests.workflows.synthetic_run import write_kernel, write_rollout, write_run
 
+pytestmark = pytest.mark.usefixtures("quick_spectra")
+
 
 @pytest.fixture
 def directory(comm, tmp_path):
@@ -36,7 +38,7 @@ def measured(directory, comm):
     return found
 
 
-@pytest.mark.mpi(2, 3)
+@pytest.mark.mpi(3)
 def test_ranks_that_share_the_work_find_what_one_finds(comm, directory):
     numbers, tables = measured(directory, comm)
     if comm.rank == 0:

@@ -41,15 +41,17 @@ def boost(comm, path):
     comm.Barrier()
 
 
-@pytest.fixture
-def truths(comm, tmp_path):
+@pytest.fixture(scope="module")
+def truths(comm, shared_folder):
     """Two directories with the same ground truth, at rest and moving. The first has the scene."""
-    prepared(comm, tmp_path / "still", overrides=OVERRIDES, model='[model]\npreset = "resolved"')
-    first_rank(comm, shutil.copytree, tmp_path / "still", tmp_path / "moving")
-    boost(comm, tmp_path / "moving/ground_truth.h5")
-    return [tmp_path / "still", tmp_path / "moving"]
+    folder = shared_folder()
+    prepared(comm, folder / "still", overrides=OVERRIDES, model='[model]\npreset = "resolved"')
+    first_rank(comm, shutil.copytree, folder / "still", folder / "moving")
+    boost(comm, folder / "moving/ground_truth.h5")
+    return [folder / "still", folder / "moving"]
 
 
+@pytest.mark.usefixtures("quick_spectra", "no_figures")
 @pytest.mark.mpi(2)
 @pytest.mark.parametrize("preset, where", [("paper", "flow"), ("local", "flow"), ("resolved", "flow"),
                                            ("resolved", "particles")])

@@ -155,7 +155,7 @@ def test_products_say_what_they_were_made_from(run_directory):
         assert origin["made_from"] == dict(list(ids.items())[:number])
 
 
-@pytest.mark.usefixtures("no_figures")
+@pytest.mark.usefixtures("no_figures", "quick_spectra")
 def test_what_fits_is_kept_and_what_changed_is_redone(comm, run_directory, capfd):
     before = {path: path.stat().st_mtime_ns for path in run_directory.glob("*.h5")}
     comm.Barrier()
@@ -170,7 +170,7 @@ def test_what_fits_is_kept_and_what_changed_is_redone(comm, run_directory, capfd
     assert replaced == {"rollout.h5", "measures.h5"}
 
 
-@pytest.mark.usefixtures("no_figures")
+@pytest.mark.usefixtures("no_figures", "quick_spectra")
 def test_a_trained_model_runs_on_another_flow(comm, run_directory, tmp_path):
     """At twice the Mach number, with the scales of that flow only."""
     slower = load_scene(TINY, ["flow.sound_speed=11", "seed=2", "spin_up.turnovers=0.5", "tracers.turnovers=0.25",

@@ -107,7 +107,7 @@ def test_memory_finds_scales_of_an_unfiltered_flow_that_one_frame_does_not_deter
     """8^3 tracers resolve wavenumbers up to 6 in one frame; the flow has them up to 11."""
     scene = prepared(comm, tmp_path, removals=["kernel", "model", "training", "simulation"], overrides=[
         "tracers.particles_per_side=8", "tracers.filtered=false", "flow.cells=24", "flow.viscosity=0.02",
-        "tracers.turnovers=1.2"])
+        "tracers.turnovers=0.8", "tracers.frame_interval=0.04"])
     errors, highest = {}, {}
     for method in ("least-squares", "memory"):
         settings = Reconstruction(method=method, fields=("velocity",), holdout=0.0)
@@ -116,20 +116,20 @@ def test_memory_finds_scales_of_an_unfiltered_flow_that_one_frame_does_not_deter
             errors[method] = file["errors_of_fields/velocity_error"][-5:].mean()
             highest[method] = file["about"].attrs["highest_wavenumber"]
     assert highest == {"least-squares": 6, "memory": 12}
-    # Measured: 0.49.
+    # Measured: 0.52.
     assert errors["memory"] < 0.6 * errors["least-squares"]
 
 
-@pytest.mark.mpi(2, 3)
+@pytest.mark.mpi(2)
 def test_fields_do_not_depend_on_the_number_of_ranks(comm, flow, tmp_path, linked):
-    errors, _ = errors_of(comm, flow, tmp_path, linked, method="memory", fields=("velocity",))
+    keys = {"method": "memory", "every": 3, "fields": ("velocity",)}
+    errors, _ = errors_of(comm, flow, tmp_path, linked, **keys)
     alone = comm.Split(comm.rank)
     if comm.rank == 0:
         scene, folder = flow
         (tmp_path / "one").mkdir()
         (tmp_path / "one/ground_truth.h5").symlink_to(folder / "ground_truth.h5")
-        reconstruct.run(replace(scene, reconstruction=Reconstruction(method="memory", fields=("velocity",))), alone,
-                        tmp_path / "one")
+        reconstruct.run(replace(scene, reconstruction=Reconstruction(**keys)), alone, tmp_path / "one")
         with h5py.File(tmp_path / "one/reconstruction.h5") as one, h5py.File(tmp_path / "reconstruction.h5") as many:
             first, second = (file["fields/reconstructed/velocity"][()] for file in (one, many))
         # Solves end at 2e-4 of the velocities, after as many iterations; sums have another order.
@@ -138,12 +138,12 @@ def test_fields_do_not_depend_on_the_number_of_ranks(comm, flow, tmp_path, linke
     assert errors["velocity_error"] < 0.1
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 @pytest.mark.parametrize("method", ["least-squares", "memory"])
 def test_a_stopped_reconstruction_is_the_one_never_stopped(comm, flow, tmp_path, linked, method):
-    scene, folder = flow
-    scene = replace(scene, reconstruction=Reconstruction(method=method, fields=("velocity", "r"), particles=True))
-    found = []
+    (scene, folder), found = flow, []
+    scene = replace(scene, reconstruction=Reconstruction(method=method, every=3, fields=("velocity", "r"),
+                                                         particles=True))
     for steps in (10**9, 3):
         directory = tmp_path / str(steps)
         if comm.rank == 0:

@@ -3,8 +3,6 @@ import json
 import math
 import os
 import re
-import subprocess
-import sys
 from dataclasses import replace
 
 import pytest
@@ -22,12 +20,13 @@ from eddies.workflows.diff import numbers_of
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 from eddies.workflows.status import status_lines
 from tests.changed_product import changed
+from tests.commands import python
 from tests.small_scene import one_model
 from tests.workflows.stopping import StopAtStep
 from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_model, write_rollout, write_run
 from tests.workflows.test_variant_rows import scene_of
 
-pytestmark = pytest.mark.mpi(1)
+pytestmark = [pytest.mark.mpi(1), pytest.mark.usefixtures("quick_spectra")]
 
 FIGURES = {
     "statistics", "spectra", "fields", "stationary", "tracers", "figure-1-kernels", "figure-2-reconstruction",
@@ -456,4 +455,4 @@ def test_numbers_and_other_figures_do_not_depend_on_a_figure(comm, tmp_path, mon
 
 def test_an_unknown_backend_does_not_matter():
     code = "import eddies.report.figures, matplotlib; matplotlib.figure.Figure().savefig('/dev/null', format='png')"
-    assert subprocess.run([sys.executable, "-c", code], env={**os.environ, "MPLBACKEND": "nonsense"}).returncode == 0
+    assert python("-c", code, env={**os.environ, "MPLBACKEND": "nonsense"}).returncode == 0

@@ -26,7 +26,7 @@ SETS = ["tracers.few.particles_per_side=4", "tracers.few.filter_width=1.2", "tra
         "tracers.whole.seed=3"]
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(2)
 def test_a_set_has_the_ground_truth_that_it_has_alone(comm, tmp_path):
     """To the last bit, also after a stop with and one without tracers."""
     scene, together = load_scene(TINY, [*SPLIT, *SETS]), tmp_path / "together"

@@ -154,7 +154,7 @@ def neighbours(space, receivers, particles):
     return int(np.count_nonzero(square < space.radius**2)) - len(receivers)  # without each with itself
 
 
-@pytest.mark.mpi(1, 3)
+@pytest.mark.mpi(3)
 def test_training_evaluates_pairs_with_ghosts_and_sums_gradients(comm, tmp_path, monkeypatch):
     assert load_scene("hit-small").variant["paper"].model == load_scene("hit-small").model  # what is trained here
     scene = load_scene("hit-small", SMALL, ["variant"])

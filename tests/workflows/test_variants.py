@@ -150,6 +150,7 @@ def test_an_error_ends_the_job_if_it_concerns_all_variants(comm, tmp_path, monke
 
 
 @pytest.mark.mpi(1, timeout=300)
+@pytest.mark.usefixtures("unmeasured")
 def test_a_variant_in_another_flow_makes_its_own_ground_truth(folder):
     """It replaces the link to the shared ground truth."""
     text = 'base = "base.toml"\nunset = ["kernel"]\nsimulation.method = "none"\ntraining.combined_steps = 0\n'
@@ -171,7 +172,7 @@ def test_a_variant_in_another_flow_makes_its_own_ground_truth(folder):
 
 
 @pytest.mark.mpi(2, timeout=300)
-@pytest.mark.usefixtures("no_figures")
+@pytest.mark.usefixtures("no_figures", "quick_solves")
 def test_variants_are_run_measured_and_kept(comm, folder, capfd, monkeypatch):
     """One that fails does not end the others, and is run again."""
     out, whole = folder / "out", simulate.run

@@ -227,9 +227,8 @@ def read_frame(dataset: h5py.Dataset, frame: int, selection: tuple[slice, ...], 
     0 to `limit` is an error, too. In a rollout, numbers that are not finite are allowed, because a rollout may end
     with them.
     """
-    values, kind = dataset[frame, *selection], python_value(dataset.file.attrs["kind"])
-    place = f"frame {frame % len(dataset)}: holds values that are"
-    if kind != "rollout" and not np.isfinite(values).all():
+    values, place = dataset[frame, *selection], f"frame {frame % len(dataset)}: holds values that are"
+    if not np.isfinite(values).all() and python_value(dataset.file.attrs["kind"]) != "rollout":
         raise unfit(dataset, f"{place} not finite")
     if limit < np.inf and np.any((values < 0) | (values > limit)):
         raise unfit(dataset, f"{place} outside the range 0 to {limit:.6g}")

@@ -96,15 +96,16 @@ class Trajectory:
         box = group["box"]
         # Edge of the periodic cube. Files of eddies 1.0 have one set of edges for all frames.
         self.length = float(box.attrs["edge"] if "edge" in box.attrs else box["edges"][0])
-        self.columns = tuple(column for column in group if f"{column}/value" in group)
+        self._ids = group["id"]
+        self._values = {column: group[f"{column}/value"] for column in group if f"{column}/value" in group}
+        self.columns = tuple(self._values)
         self._in_order: set[tuple[int, int | None]] = set()  # rows whose ids have been checked
 
     @cached_property
     def times(self) -> np.ndarray:
         """Time of each frame, (frames,)."""
         times = read_times(self._group["time"])
-        for column in self.columns:
-            dataset = self._group[column]["value"]
+        for dataset in self._values.values():
             if dataset.shape[:2] != (len(times), self.total):
                 raise unfit(dataset, f"holds {dataset.shape[:2]} frames and particles, but there are "
                                      f"{(len(times), self.total)} times and ids")
@@ -121,13 +122,14 @@ class Trajectory:
         Raises ProductError if ids are not in order, a position is outside the cube or, except in a rollout, a number
         is not finite.
         """
-        rows, ids = slice(start, stop), self._group["id"]
+        rows = slice(start, stop)
         if (start, stop) not in self._in_order:
-            if not np.array_equal(ids[rows], np.arange(*rows.indices(self.total))):
-                raise unfit(ids, "holds ids that are not in order")
+            if not np.array_equal(self._ids[rows], np.arange(*rows.indices(self.total))):
+                raise unfit(self._ids, "holds ids that are not in order")
             self._in_order.add((start, stop))
         limit = self.length * (1 + ROUNDING) if column == "position" else np.inf
-        return read_frame(find_group(self._group, column)["value"], frame, (rows,), limit)
+        dataset = self._values[column] if column in self._values else find_group(self._group, column)["value"]
+        return read_frame(dataset, frame, (rows,), limit)
 
 
 def write_h5md_header(file: h5py.File) -> None:

@@ -28,6 +28,7 @@ from tests.commands import first_rank
 from tests.changed_product import changed
 from tests.workflows.small_rollout import with_method
 
+pytestmark = pytest.mark.usefixtures("no_figures")
 CPU = torch.device("cpu")
 SCENE = """
 [flow]

@@ -27,7 +27,7 @@ from tests.commands import first_rank
 from tests.workflows.small_rollout import OWN_METHOD, prepared, scales_of, scene_text, with_method
 from tests.workflows.stopping import StopAtStep
 
-pytestmark = pytest.mark.usefixtures("quick_spectra")
+pytestmark = pytest.mark.usefixtures("unmeasured", "quick_spectra")
 
 
 def method_of(comm, directory, scene, start):
