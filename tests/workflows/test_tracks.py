@@ -157,7 +157,7 @@ def test_data_as_published_are_trained_on_end_to_end(comm, tmp_path, no_figures,
         true = dict(file["reference"].attrs)
     scene = scene_of(comm, tmp_path, f"""[tracks]
 path = "published.npz"
-interval = 0.02
+frame_rate = 50.0
 filtered = true
 box = {2 * np.pi}
 sound_speed = 15.0

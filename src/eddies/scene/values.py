@@ -128,6 +128,11 @@ def text(about: str, default: Any = MISSING) -> Any:
     return _declare(Rule(str, about), default)
 
 
+def column(about: str, default: Any = None) -> Any:
+    """Declare a dataclass field that holds the name of a column, or its number from 1 on."""
+    return _declare(Rule(str, about, numbered=True), default)
+
+
 def texts(about: str, *words: str, default: Any = MISSING, paths: bool = False) -> Any:
     """Declare a dataclass field that holds a tuple of strings.
 

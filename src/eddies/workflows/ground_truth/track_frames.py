@@ -10,6 +10,7 @@ import numpy as np
 
 from eddies.analysis.track_splines import smooth
 from eddies.clock import SAME
+from eddies.io.file_patterns import FileVersion, file_versions
 from eddies.io.hdf5 import in_files
 from eddies.io.track_files import Tracks, check_inside, check_velocities, checked, read_tracks
 from eddies.parallel.communicator import Comm
@@ -120,13 +121,13 @@ def read_measured(settings: Settings) -> MeasuredTracks:
     If splines are needed, tracks with fewer than three rows are left out. Raises ProductError if the file cannot be
     used, SceneError if it does not fit [tracks], for example with too few frames.
     """
-    state = settings.file.stat() if settings.file.is_file() else None
-    return _read_measured(settings, state and (state.st_size, state.st_mtime_ns))
+    return _read_measured(settings, file_versions(settings.file))
 
 
 @lru_cache(maxsize=1)  # a run reads a file more than once
-def _read_measured(settings: Settings, state: tuple[int, int] | None) -> MeasuredTracks:
-    found = read_tracks(settings.file, settings.format, settings.group, settings.interval)
+def _read_measured(settings: Settings, versions: tuple[FileVersion, ...]) -> MeasuredTracks:
+    found = read_tracks(settings.file, settings.format, settings.group, settings.frame_rate,
+                        settings.columns.given if settings.columns else None)
     found, edge, volume, corner = _placed(found, settings)
     if settings.sound_speed is not None and found.density is None:
         raise SceneError(f"[tracks] sound_speed = {settings.sound_speed:g}: {settings.file} has no densities; remove "
