@@ -130,7 +130,7 @@ BAD_OVERRIDES = [
     ("spin_up.stationary=1", "[spin_up] stationary = 1: must be less than turnovers = 1"),
     ("time.duration=3", "[time] duration = 3: with [tracers] the run time is [tracers] turnovers"),
     ("tracers.field_cells=32", "[tracers] field_cells = 32: must be at most [flow] cells = 24"),
-    ("kernel.neighbors=2000", "half the cube, 3.14; lower neighbors or raise [tracers] particles_per_side"),
+    ("kernel.neighbors=2000", "half the cube, 3.14; lower neighbors to less than "),
     ("model.neighbors=2000", "[model] neighbors = 2000: with 1728 particles radius and skin together are 4.5"),
     ('model.terms=["pressure", "continuity"]', '"continuity" gives its rate, so it is given twice'),
     ('model.terms=["pairs"]', '"pairs" reads the density, which no term gives'),

@@ -190,6 +190,25 @@ def test_rows_that_are_none_are_refused_before_anything_is_written(tmp_path, cha
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("edge", [np.nan, 0, -1, np.inf])
+def test_an_edge_that_is_none_is_refused(tmp_path, edge):
+    with pytest.raises(ProductError, match="t.h5: edge = .*: must be a positive number"):
+        write_tracks(tmp_path / "t.h5", *shear(np.array([0.0, 0.1])), edge=edge)
+    assert not list(tmp_path.iterdir())
+
+
+def test_masked_rows_are_not_written(tmp_path):
+    rows = shear(np.array([0.0, 0.1, 0.2]))
+    hidden = np.zeros(len(rows[0]), bool)
+    hidden[[2, 5, 11]] = True
+    position, velocity = np.ma.array(rows[2]), np.ma.array(rows[3])
+    position[2, 1] = position[5] = velocity[11, 2] = np.ma.masked
+    write_tracks(tmp_path / "t.h5", rows[0], rows[1], position, velocity, edge=EDGE)
+    assert_same(read_tracks(tmp_path / "t.h5"), [part[~hidden] for part in rows])
+    write_tracks(tmp_path / "t.h5", rows[0], np.ma.array(rows[1], mask=hidden), *rows[2:], edge=EDGE)
+    assert_same(read_tracks(tmp_path / "t.h5"), [part[~hidden] for part in rows])
+
+
 @pytest.mark.parametrize("name, content, words", [
     ("a.csv", "track,time,x,y\n1,0,0,0\n", "names track, time, x, y; add or correct z"),
     ("a.csv", "trakc,time,x,y,z\n1,0,0,0,0\n", "names trakc, .*; add or correct track"),

@@ -39,6 +39,7 @@ METADATA = "metadata.json"              # file beside those of LagrangeBench
 ROWS = ("trajectories", "particles")    # groups or tables of flowtracks
 FILL = -1  # the id of a row without a particle
 MOST_ID = 2**53  # larger ids are not exact in double precision
+OFF = 5.0  # largest error of a coordinate, in standard deviations
 MOST_OFF = 2.0  # if displacement and velocity * interval differ by a larger factor, their units are wrong
 
 
@@ -133,14 +134,23 @@ def write_tracks(path: str | Path, times: Any, ids: Any, positions: Any, velocit
     positions, velocities : (rows, 3); velocities may be None.
     edge : edge of the periodic cube.
 
+    Rows with a masked value are left out.
+
     Raises:
-        ProductError: a value is not finite, the arrays have different numbers of rows, a track appears twice at one
-            time, or the file cannot be written.
+        ProductError: a value is not finite, the edge is not positive, the arrays have different numbers of rows, a
+            track appears twice at one time, or the file cannot be written.
     """
     path = Path(path)
-    columns = {"time": np.asarray(times, float), "track": np.asarray(ids), "position": np.asarray(positions, float),
-               "velocity": None if velocities is None else np.asarray(velocities, float)}
-    tracks = checked(Tracks(**columns, edge=float(edge)), path)
+    if not 0 < edge < math.inf:
+        raise ProductError(f"{path}: edge = {edge}: must be a positive number; give the edge of the periodic cube")
+    given = {"time": times, "track": ids, "position": positions, "velocity": velocities}
+    tracks = Tracks(edge=float(edge), **{
+        name: None if values is None else np.asarray(values, None if name == "track" else float)
+        for name, values in given.items()})
+    masks = [np.ma.getmaskarray(values) for values in given.values() if np.ma.is_masked(values)]
+    if masks:
+        tracks = tracks.chosen(~np.any([mask.reshape(len(mask), -1).any(1) for mask in masks], axis=0))
+    tracks = checked(tracks, path)
     rows = tracks.starts[1:] - tracks.starts[:-1]
     frames, most = len(rows), int(rows.max())
     frame = np.repeat(np.arange(frames), rows)
@@ -325,12 +335,14 @@ def checked(tracks: Tracks, path: Path) -> Tracks:
     return sorted_tracks
 
 
-def check_inside(tracks: Tracks, lower: np.ndarray, upper: np.ndarray, key: str, path: str | Path) -> None:
-    """Raise ProductError if positions are outside the region from `lower` to `upper`.
+def check_inside(tracks: Tracks, lower: np.ndarray, upper: np.ndarray, key: str, path: str | Path,
+                 noise: float = 0.0) -> None:
+    """Raise ProductError if positions are outside the region from `lower` to `upper` by more than their noise.
 
     The region or the unit of length is then wrong. `key` is the scene key that gives the region, "box" or "volume".
+    `noise` is the standard deviation of the error of a coordinate.
     """
-    margin = ROUNDING * (upper - lower)
+    margin = ROUNDING * (upper - lower) + OFF * noise
     outside = np.flatnonzero(((tracks.position < lower - margin) | (tracks.position > upper + margin)).any(1))
     if len(outside):
         row, (place, low, high) = outside[0], (", ".join(f"{x:.4g}" for x in point) for point in (

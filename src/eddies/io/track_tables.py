@@ -175,8 +175,8 @@ def read_table(path: Path, columns: Mapping[str, str | int] | None = None, frame
     parts = [part for part in parts if part.rows]
     if not parts:
         return np.zeros(0), np.zeros(0), np.zeros((0, 3)), None
-    _number_tracks(parts)
     _number_zones(parts)
+    _number_tracks(parts)
     names = [name for name in (*NEEDED, *VELOCITY) if all(name in part.columns for part in parts)]
     values = {name: _joined([part.columns.pop(name) for part in parts]) for name in names}
     time, track = values["time"], values["track"]

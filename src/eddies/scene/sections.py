@@ -148,8 +148,9 @@ class Tracks(Section):
     columns: Columns | None = section(Columns, default=None)
     group: str | None = text("name of the particles or of the trajectory in a file with several", default=None)
     box: float | None = number("edge of the periodic cube; absent: that of the file", default=None, above=0)
-    volume: tuple[float, ...] | None = numbers("x0, x1, y0, y1, z0, z1 of a volume that is not periodic, in place of "
-                                               "box", default=None)
+    volume: tuple[float, ...] | str | None = numbers("x0, x1, y0, y1, z0, z1 of a volume that is not periodic, in "
+                                                     "place of box; auto: from the positions", default=None,
+                                                     words=("auto",))
     margin: float | None = number("distance between the volume and its image in the periodic cube around it; absent: "
                                   "four mean spacings", default=None, above=0)
     time_unit: float = number("factor from times of the file to the time unit of its velocities", default=1.0, above=0)
@@ -162,7 +163,11 @@ class Tracks(Section):
     viscosity: float | None = number("kinematic viscosity, for terms that need it", default=None, above=0)
     sound_speed: float | None = number("speed of sound, for terms that need the density; the file must have densities",
                                        default=None, above=0)
-    noise: float = number("standard deviation of the error of a measured coordinate", default=0.0, at_least=0)
+    noise: float | str | None = number("standard deviation of the error of a measured coordinate; auto: estimated; "
+                                       "absent: estimated if the file has no velocities, else 0", default=None,
+                                       words=("auto",), at_least=0)
+    longest_gap: int = integer("largest number of frames that a track may lack; a track is divided at a longer gap",
+                               default=2, at_least=0)
     field_every: int = integer("interval between reconstructed fields, in frames", default=5, at_least=1)
 
     def __post_init__(self) -> None:
@@ -172,7 +177,8 @@ class Tracks(Section):
                 raise self.problem("margin", "this key belongs to volume, which is missing; remove it, or give volume "
                                    "in place of box")
             return
-        if len(self.volume) != 6 or not all(low < high for low, high in zip(self.volume[::2], self.volume[1::2])):
+        if not isinstance(self.volume, str) and (len(self.volume) != 6 or not all(
+                low < high for low, high in zip(self.volume[::2], self.volume[1::2]))):
             raise self.problem("volume", "must be six numbers x0, x1, y0, y1, z0, z1 with x0 < x1, y0 < y1, z0 < z1")
         if self.box is not None:
             raise self.problem("box", "a volume is given too, which is not periodic; remove one of the two")
