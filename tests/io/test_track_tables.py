@@ -78,7 +78,8 @@ def test_rows_of_openptv_are_linked_from_file_to_file(tmp_path, caplog, extra):
     for frame, particles in LINKED.items():
         lines = [" ".join(map(str, (*links, x, 0.5, -x, *extra))) for *links, x in particles]
         (tmp_path / f"ptv_is.{frame}").write_text("\n".join([str(len(particles)), *lines, "", ""]))
-    (tmp_path / "ptv_is.4").write_text("0\n")
+    for frame in (0, 4):
+        (tmp_path / f"ptv_is.{frame}").write_text("0\n")
     found = read_tracks(tmp_path / "ptv_is.*", frame_rate=2)
     tracks = {tuple(found.position[found.track == track, 0]) for track in np.unique(found.track)}
     assert tracks == {(2, 3, 5), (0, 4)}  # 0: previous of 4; 2, 3, 5: links both ways

@@ -105,7 +105,7 @@ def read_tracks(path: str | Path, layout: str | None = None, group: str | None =
         raise ProductError(f"{path}: no such file; give the path of a file with particle tracks")
     try:
         with read_errors(path):
-            layout = layout or _layout_of(files[0])
+            layout = layout or _layout_of(max(files, key=lambda file: file.stat().st_size))
             if layout not in LAYOUTS:
                 raise ProductError(f"{path}: layout = {layout!r}: must be one of {', '.join(LAYOUTS)}")
             if layout == "csv":
