@@ -194,7 +194,7 @@ def allowed(rule):
         return "`true`, `false`"
     if rule.kind is str and words:
         return ("list of " if rule.many else "") + ", ".join(words) + (" or an import path" if rule.paths else "")
-    noun = {float: "number", int: "integer", str: "string"}[rule.kind]
+    noun = {float: "number", int: "integer", str: "string or integer ≥ 1" if rule.numbered else "string"}[rule.kind]
     symbols = {"above": ">", "at_least": "≥", "below": "<", "at_most": "≤"}
     limits = " and ".join(f"{symbols[name]} {'π' if bound == BOX_LENGTH / 2 else format(bound, 'g')}"
                           for name, bound in rule.bounds.given.items())

@@ -66,6 +66,40 @@ def test_fast_and_slow_cameras_need_different_smoothing(interval, frames, noise,
     assert found.residual == pytest.approx(noise, rel=0.05)  # sampling errors are 0.4 to 1 %, and splines miss a little
 
 
+@pytest.mark.parametrize("noise", [1e-3, 1e-2, 5e-2])
+@pytest.mark.parametrize("frames", [10, 50])
+def test_noise_is_estimated_and_velocities_are_those_of_a_given_noise(frames, noise):
+    """The residuals of forty tracks of ten frames leave about 600 degrees of freedom, and an error of 3 %; the truth
+    has a part that splines miss."""
+    time, track, position, velocity = tracks(frames=frames)
+    noisy = position + noise * np.random.default_rng(2).standard_normal(position.shape)
+    found, given = smooth(time, track, noisy, EDGE, None), smooth(time, track, noisy, EDGE, noise)
+    assert found.residual == pytest.approx(noise, rel=0.2 if noise == 1e-3 else 0.06)
+    assert error(found.velocity, velocity[found.rows]) < 1.05 * error(given.velocity, velocity[given.rows])
+
+
+def test_tracks_without_noise_are_not_smoothed_when_it_is_estimated():
+    time, track, position, _ = tracks()
+    found = smooth(time, track, position, EDGE, None)
+    assert found.smoothing == NO_NOISE and found.residual < 1e-5
+
+
+def test_gaps_are_filled_with_the_rows_of_the_splines():
+    time, track, position, velocity = tracks()
+    frame = np.rint(time / INTERVAL)
+    there = np.flatnonzero(~np.isin(frame, (0, 20, 21, 35)) | (track % 2 == 0))
+    found = smooth(time[there], track[there], position[there], EDGE, fill=INTERVAL)
+    order = np.lexsort((found.time, found.track))
+    expected = (frame > 0) | (track % 2 == 0)  # a track is not continued beyond its ends
+    np.testing.assert_array_equal(found.track[order], track[expected])
+    np.testing.assert_allclose(found.time[order], time[expected], atol=1e-12)
+    np.testing.assert_array_equal(found.rows[order] < 0, np.isin(frame, (20, 21, 35))[expected] & (track % 2)[expected])
+    filled = found.rows[order] < 0
+    assert 0 < error(found.velocity[order][filled], velocity[expected][filled]) < 3e-3  # 0.0018 for two frames
+    known = found.rows[~(found.rows < 0)]
+    np.testing.assert_allclose(found.position[found.rows >= 0], position[there][known], atol=1e-4)
+
+
 @pytest.mark.parametrize("frames", [4, 50, 2000])
 def test_the_limit_of_strong_smoothing_is_the_parabola_of_least_squares(frames):
     draw = np.random.default_rng(4)
@@ -77,7 +111,7 @@ def test_the_limit_of_strong_smoothing_is_the_parabola_of_least_squares(frames):
     parabola = (basis @ np.linalg.lstsq(basis, values, rcond=None)[0]).reshape(frames, 2, 3).transpose(1, 0, 2)
     for smoothing in (PARABOLA * float(frames) ** 6, 1e200):
         # Round-off of third differences, integrated three times, grows with the cube of the number of rows.
-        np.testing.assert_allclose(next(fit.derivatives(smoothing)), parabola.reshape(-1, 3), rtol=0, atol=1e-7)
+        np.testing.assert_allclose(next(fit.derivatives(smoothing, time)), parabola.reshape(-1, 3), rtol=0, atol=1e-7)
     assert fit.residual(1e200)[2] / 6 == pytest.approx(frames - 3, abs=1e-4)
 
 

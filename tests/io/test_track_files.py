@@ -57,11 +57,11 @@ def test_a_table_of_a_tracking_program(tmp_path):
 def test_arrays_as_published_with_the_paper(tmp_path):
     position = np.random.default_rng(1).uniform(0, EDGE, (4, 9, 3)).astype(np.float32)
     np.savez(tmp_path / "a.npz", pos=position, vel=-position, rho=np.ones((4, 9)))
-    found = read_tracks(tmp_path / "a.npz", interval=0.5)
+    found = read_tracks(tmp_path / "a.npz", frame_rate=2)
     np.testing.assert_array_equal(found.times, [0, 0.5, 1, 1.5])
     np.testing.assert_array_equal(found.position.reshape(4, 9, 3), position)
     np.testing.assert_array_equal(found.velocity, -found.position)
-    with pytest.raises(ProductError, match="a.npz.*interval"):
+    with pytest.raises(ProductError, match="a.npz.*frame_rate"):
         read_tracks(tmp_path / "a.npz")
 
 
@@ -77,6 +77,45 @@ def test_a_trajectory_of_lagrangebench(tmp_path):
     assert found.edge == 2
     with pytest.raises(ProductError, match="group = None.*00000, 00001"):
         read_tracks(tmp_path / "train.h5")
+
+
+@pytest.mark.parametrize("table", [True, False])
+def test_rows_of_flowtracks_are_a_table_or_a_group(tmp_path, table):
+    """A table of PyTables with rows of mixed types, or a group of arrays; times are numbers of frames."""
+    columns = {"trajid": np.array([4, 4, 7]), "pos": np.eye(3), "vel": 2 * np.eye(3), "time": np.array([10.0, 11, 11])}
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        if table:
+            columns["velocity"] = columns.pop("vel")
+            rows = np.zeros(3, [(name, values.dtype, values.shape[1:]) for name, values in columns.items()])
+            for name, values in columns.items():
+                rows[name] = values
+            file["particles"] = rows
+        else:
+            for name, values in columns.items():
+                file[f"trajectories/{name}"] = values
+    found = read_tracks(tmp_path / "a.h5", frame_rate=10)
+    np.testing.assert_array_equal(found.time, [1, 1.1, 1.1])
+    np.testing.assert_array_equal(found.track, [4, 4, 7])
+    np.testing.assert_array_equal(found.velocity, 2 * found.position)
+
+
+def test_hdf5_of_another_program_is_told_what_it_lacks(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["points"] = np.eye(3)
+    with pytest.raises(ProductError, match="a.h5: holds points, but no particles/GROUP/position .*no metadata.json"):
+        read_tracks(tmp_path / "a.h5")
+
+
+def test_keys_of_tables_are_refused_for_other_files(tmp_path):
+    write_tracks(tmp_path / "a1.h5", *shear(np.array([0.0, 0.1])))
+    write_tracks(tmp_path / "a2.h5", *shear(np.array([0.0, 0.1])))
+    np.savez(tmp_path / "a.npz", pos=np.zeros((2, 2, 3)), time=np.arange(2))
+    for name, keys, words in (("a1.h5", {"frame_rate": 2.0}, "h5md, whose frames have times; remove frame_rate"),
+                              ("a1.h5", {"columns": {"x": 1}}, "columns is for tables only"),
+                              ("a.npz", {"frame_rate": 2.0}, "holds an array time; remove frame_rate"),
+                              ("a*.h5", {}, "names 2 files, but only tables may be several")):
+        with pytest.raises(ProductError, match=words):
+            read_tracks(tmp_path / name, **keys)
 
 
 def test_h5md_with_a_constant_interval_and_an_offset(tmp_path):
@@ -149,6 +188,25 @@ def test_rows_that_are_none_are_refused_before_anything_is_written(tmp_path, cha
     with pytest.raises(ProductError, match=words):
         write_tracks(tmp_path / "t.h5", **changed(shear(np.array([0.0, 0.1, 0.2])), **changes))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("edge", [np.nan, 0, -1, np.inf])
+def test_an_edge_that_is_none_is_refused(tmp_path, edge):
+    with pytest.raises(ProductError, match="t.h5: edge = .*: must be a positive number"):
+        write_tracks(tmp_path / "t.h5", *shear(np.array([0.0, 0.1])), edge=edge)
+    assert not list(tmp_path.iterdir())
+
+
+def test_masked_rows_are_not_written(tmp_path):
+    rows = shear(np.array([0.0, 0.1, 0.2]))
+    hidden = np.zeros(len(rows[0]), bool)
+    hidden[[2, 5, 11]] = True
+    position, velocity = np.ma.array(rows[2]), np.ma.array(rows[3])
+    position[2, 1] = position[5] = velocity[11, 2] = np.ma.masked
+    write_tracks(tmp_path / "t.h5", rows[0], rows[1], position, velocity, edge=EDGE)
+    assert_same(read_tracks(tmp_path / "t.h5"), [part[~hidden] for part in rows])
+    write_tracks(tmp_path / "t.h5", rows[0], np.ma.array(rows[1], mask=hidden), *rows[2:], edge=EDGE)
+    assert_same(read_tracks(tmp_path / "t.h5"), [part[~hidden] for part in rows])
 
 
 @pytest.mark.parametrize("name, content, words", [

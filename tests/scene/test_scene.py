@@ -206,7 +206,9 @@ def test_built_in_scenes_have_the_schema(name):
     ("flow.cells = 7", False), ("flow.cels = 8", False), ("simulation.step = 0.1", True), ("time.step = 'none'", True),
     ("simulation.step = 'long'", False), ("forcing.wavenumber = 1", False), ("model.Drag.k = 1", True),
     ("model.terms = ['pairs', 'own:Drag']", True),
-    ("model.terms = ['pears']", False), ("kernel.hidden = [8, 0]", False), ("variant.a.flow.cells = 7", False)])
+    ("model.terms = ['pears']", False), ("kernel.hidden = [8, 0]", False), ("variant.a.flow.cells = 7", False),
+    ("tracks.volume = 'auto'", True), ("tracks.volume = [0, 1]", True), ("tracks.volume = ['auto']", False),
+    ("tracks.columns.x = 0", False), ("tracks.columns = {x = 1, y = 'Y'}", True)])
 def test_the_schema_accepts_what_a_scene_may_hold(override, accepted):
     import tomllib
     jsonschema = pytest.importorskip("jsonschema")

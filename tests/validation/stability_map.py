@@ -1,6 +1,6 @@
 """The map of stability of the learned systems: when and why a rollout breaks off, or its error at T/2. A script.
 
-    .venv/bin/python tests/validation/stability_map.py runs/ladder VARIANT [VARIANT ...]
+    PYTHONPATH=docs/ladder .venv/bin/python tests/validation/stability_map.py runs/ladder VARIANT [VARIANT ...]
 
 Rollouts of trained variants of the ladder over step, Mach number, width of the filter, number of neighbours,
 arrangement of the particles at the start, density, frame of reference, precision and weights; one change at a time.

@@ -103,7 +103,7 @@ def test_times_become_equal_ones_and_a_gap_is_named(comm, tmp_path):
     position = draw.uniform(0, 6, (30, 3))[track] + np.outer(time, [0.1, 0.2, 0.3])
     given = np.where(track % 3, np.round(time, 5), time)
     write_tracks(tmp_path / "a.h5", given, track, position)
-    scene = scene_of(comm, tmp_path, f'[tracks]\npath = "a.h5"\nbox = {2 * np.pi}\n')
+    scene = scene_of(comm, tmp_path, f'[tracks]\npath = "a.h5"\nbox = {2 * np.pi}\nlongest_gap = 0\n')
     found = read_measured(scene.tracks)
     np.testing.assert_allclose(found.times, np.arange(7) * 0.00333333, rtol=1e-5)
     assert found.complete == 30
@@ -157,7 +157,7 @@ def test_data_as_published_are_trained_on_end_to_end(comm, tmp_path, no_figures,
         true = dict(file["reference"].attrs)
     scene = scene_of(comm, tmp_path, f"""[tracks]
 path = "published.npz"
-interval = 0.02
+frame_rate = 50.0
 filtered = true
 box = {2 * np.pi}
 sound_speed = 15.0

@@ -8,7 +8,12 @@ x_i are the measured positions. This estimate assumes that their errors have equ
 third derivative of the true position, is white noise (TrackFit; Gesemann, Huhn, Schanz and Schröder 2016). The spline
 damps angular frequencies above mu^(-1/6) / h. It needs no condition at the ends of a track. For large mu it is a
 parabola, fitted by least squares.
+
+If the variance is not known, mu minimises the error of generalised cross-validation, n RSS / tr(R)^2, and the variance
+is RSS / tr(R) (Wahba 1983). RSS is the sum of the n squared residuals, R the matrix that maps positions to residuals.
 """
+
+from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
@@ -26,6 +31,7 @@ NO_NOISE = 1e-6             # smallest mu, which damps no frequency that the fra
 PARABOLA = 1e3              # mu divided by the sixth power of the number of rows, for which a spline is a parabola
 TRIED = 300                 # about the number of tracks from which mu is determined
 BLOCK = 256                 # columns of an influence matrix that are computed at a time
+EQUAL = 1e-6                # fraction of the interval below which times of tracks are the same
 
 
 @dataclass(frozen=True)
@@ -34,14 +40,18 @@ class SmoothedTracks:
 
     Parameters
     ----------
-    rows : for each row, its row number in the arguments of `smooth`. Tracks with fewer than three rows are left out.
+    rows : for each row, its row number in the arguments of `smooth`; -1 for a row at a time that the track lacks.
+        Tracks with fewer than three rows are left out.
+    time, track : time and number of the track, (rows,).
     position, velocity : (rows, 3). Positions are continuous along a track.
     smoothing : mu of the splines.
-    residual : noise that the residuals of the longest tracks show. It is the given noise if a mu fits it. It is NaN
-        without noise, and for tracks of three rows, which have no residuals.
+    residual : noise that the residuals of the longest tracks show. It is the given noise if a mu fits it, and the
+        estimate if none is given. It is NaN without noise, and for tracks of three rows, which have no residuals.
     """
 
     rows: np.ndarray
+    time: np.ndarray
+    track: np.ndarray
     position: np.ndarray
     velocity: np.ndarray
     smoothing: float
@@ -49,7 +59,7 @@ class SmoothedTracks:
 
 
 def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: float | None,
-           noise: float = 0.0) -> SmoothedTracks:
+           noise: float | None = 0.0, fill: float | None = None) -> SmoothedTracks:
     """Return tracks after smoothing by splines.
 
     Parameters
@@ -59,24 +69,44 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
     edge : edge of a periodic cube, or None. Particles must move by less than half an edge between rows of a track.
     noise : standard deviation of the error of a measured coordinate. It determines mu: the squared residuals are then
         those that independent errors of this deviation leave. If it is 0, mu is NO_NOISE. If no mu fits it, `residual`
-        of the result differs from it.
+        of the result differs from it. If it is None, it is estimated.
+    fill : interval of frames. The result then has rows at all frames between the first and the last of a track. None:
+        it has the times of the track.
     """
     order = np.lexsort((time, track))
-    ends = np.flatnonzero(np.diff(track[order], append=track[order][-1] - 1)) + 1
+    steps, within = np.diff(time[order]), np.diff(track[order]) == 0
+    if not within.any():
+        nothing = np.zeros((0, 3))
+        return SmoothedTracks(np.zeros(0, int), np.zeros(0), np.zeros(0, int), nothing, nothing, NO_NOISE, np.nan)
+    interval = float(np.median(steps[within]))
+    ends = np.append(np.flatnonzero(~within) + 1, len(order))
     alike: dict[bytes, list[np.ndarray]] = defaultdict(list)
     for start, stop in zip([0, *ends[:-1]], ends):
         if stop - start >= LEAST_ROWS:
             rows = order[start:stop]
-            alike[time[rows].tobytes()].append(rows)
+            alike[np.rint((time[rows] - time[rows[0]]) / (EQUAL * interval)).tobytes()].append(rows)
     groups = [np.array(rows) for rows in alike.values()]
     if not groups:
-        nothing = np.zeros((0, 3))
-        return SmoothedTracks(np.zeros(0, int), nothing, nothing, NO_NOISE, np.nan)
-    interval = float(np.median(np.concatenate([np.diff(time[rows[0]]) for rows in groups])))
-    fits = [Fit(time[rows[0]], _unwrapped(position[rows], edge), interval) for rows in groups]
-    smoothing, residual = _smoothing_of(fits, noise) if noise > 0 else (NO_NOISE, np.nan)
-    values = [np.concatenate(parts) for parts in zip(*(fit.derivatives(smoothing) for fit in fits))]
-    return SmoothedTracks(np.concatenate([rows.ravel() for rows in groups]), *values, smoothing, residual)
+        return smooth(time[:1], track[:1], position[:1], edge)
+    fits = [Fit(time[rows[0]] - time[rows[0, 0]], _unwrapped(position[rows], edge), interval) for rows in groups]
+    smoothing, residual = (NO_NOISE, np.nan) if noise == 0 else _smoothing_of(fits, noise)
+    parts = [_sampled(fit, smoothing, rows, time[rows[:, 0]], track[rows[:, 0]], fill)
+             for fit, rows in zip(fits, groups)]
+    return SmoothedTracks(*map(np.concatenate, zip(*parts)), smoothing, residual)
+
+
+def _sampled(fit: Fit, smoothing: float, rows: np.ndarray, start: np.ndarray, track: np.ndarray,
+             fill: float | None) -> tuple[np.ndarray, ...]:
+    """Return the first five arrays of `SmoothedTracks` for the tracks of a fit, which begin at `start` (tracks,).
+    `rows` (tracks, n) holds their row numbers."""
+    times = fit.times
+    if fill is not None:
+        frames = np.rint(times / fill).astype(int)
+        times = fill * np.arange(frames[-1] + 1)
+        rows, known = np.full((len(rows), len(times)), -1), rows
+        rows[:, frames] = known
+    return (rows.ravel(), np.add.outer(start, times).ravel(), np.repeat(track, len(times)),
+            *fit.derivatives(smoothing, times))
 
 
 class Fit:
@@ -139,15 +169,16 @@ class Fit:
         squares = np.sum((self.spline(smoothing)(self.times) - self._values) ** 2)
         return np.array([squares, 3 * self.tracks * left, 3 * self.tracks * freedom])
 
-    def derivatives(self, smoothing: float) -> Iterator[np.ndarray]:
-        """Yield the smoothed positions, then the velocities, each (tracks * n, 3), track after track."""
+    def derivatives(self, smoothing: float, times: np.ndarray) -> Iterator[np.ndarray]:
+        """Yield positions, then velocities, of the splines at `times` (m,), each (tracks * m, 3), track after track."""
         spline = self.spline(smoothing)
-        for values in (spline(self.times), spline.derivative()(self.times)):
-            yield np.moveaxis(values.reshape(len(self.times), self.tracks, 3), 1, 0).reshape(-1, 3)
+        for values in (spline(times), spline.derivative()(times)):
+            yield np.moveaxis(values.reshape(len(times), self.tracks, 3), 1, 0).reshape(-1, 3)
 
 
-def _smoothing_of(fits: list[Fit], noise: float) -> tuple[float, float]:
+def _smoothing_of(fits: list[Fit], noise: float | None) -> tuple[float, float]:
     """Return the mu that fits the noise of the longest tracks, and the noise that their residuals show with this mu.
+    Without a given noise, return the mu of generalised cross-validation, and the noise that it estimates.
 
     If the noise is too large for any mu, the splines are parabolas. mu is at least the power of ten that minimises the
     error of generalised cross-validation, which needs no noise. Otherwise a noise that is given 2 % too small would
@@ -169,8 +200,11 @@ def _smoothing_of(fits: list[Fit], noise: float) -> tuple[float, float]:
 
     tried = np.arange(np.log10(NO_NOISE), np.log10(PARABOLA * rows**6) + 1)
     squares, left, freedom = np.transpose([sums(logarithm) for logarithm in tried])
+    crossed = np.argmin(squares / freedom**2)
+    best = tried[crossed]
+    if noise is None:
+        return float(10.0**best), float(np.sqrt(squares[crossed] / freedom[crossed]))
     fitting = np.flatnonzero(squares <= left * noise**2)
-    best = tried[np.argmin(squares / freedom**2)]
     if len(fitting):
         last = fitting[-1]
         best = max(best, tried[-1] if last == len(tried) - 1 else brentq(

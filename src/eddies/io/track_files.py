@@ -1,4 +1,4 @@
-"""Particle tracks of experiments and other programs, read in four layouts and written in the first of them.
+"""Particle tracks of experiments and other programs, read in five layouts and written in the first of them.
 
 A track is the path of one particle. Tracks are kept as rows, one for each particle and time, sorted by time. Layouts:
 
@@ -7,14 +7,15 @@ A track is the path of one particle. Tracks are kept as rows, one for each parti
 - "npz": NumPy arrays `pos` and `vel` (frames, particles, 3) and `rho` (frames, particles), as published with Tian et
   al. (2023). The file may also have the times of the frames, `time` (frames,).
 - "lagrangebench": TRAJECTORY/position (frames, particles, 3) and metadata.json beside the file (Toshev et al. 2023).
-- "csv": a table with the columns track, time, x, y, z and optionally u, v, w, as tracking programs write it.
+- "flowtracks": rows with `trajid`, `time`, `pos` and `vel` or `velocity`, in the group or table /trajectories or
+  /particles.
+- "csv": a table, or a series of tables, as tracking programs write them (io/track_tables.py).
 """
 
 from __future__ import annotations
 
 import json
 import math
-import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,13 +28,18 @@ import h5py
 import numpy as np
 
 from eddies.io.errors import ProductError, read_errors
+from eddies.io.file_patterns import matching_files
 from eddies.io.new_files import create_export
+from eddies.io.track_tables import is_table, read_table
 from eddies.io.trajectories import ROUNDING, write_h5md_header
 
-AXES = ("x", "y", "z")
 SUFFIXES = {".npz": "npz", **dict.fromkeys((".csv", ".txt", ".dat", ".tsv"), "csv")}
+TIMED = ("h5md", "lagrangebench")       # layouts whose frames have times
+METADATA = "metadata.json"              # file beside those of LagrangeBench
+ROWS = ("trajectories", "particles")    # groups or tables of flowtracks
 FILL = -1  # the id of a row without a particle
 MOST_ID = 2**53  # larger ids are not exact in double precision
+OFF = 5.0  # largest error of a coordinate, in standard deviations
 MOST_OFF = 2.0  # if displacement and velocity * interval differ by a larger factor, their units are wrong
 
 
@@ -77,28 +83,41 @@ class Tracks:
 
 
 def read_tracks(path: str | Path, layout: str | None = None, group: str | None = None,
-                interval: float | None = None) -> Tracks:
-    """Read the tracks of a file.
+                frame_rate: float | None = None, columns: Mapping[str, str | int] | None = None) -> Tracks:
+    """Read the tracks of a file, or of a series of tables.
 
     Parameters
     ----------
+    path : path of the file. In that of a series of tables * stands for any text.
     layout : one of LAYOUTS; None to find it by the name and content of the file.
     group : name of the group of particles (H5MD) or of the trajectory (LagrangeBench); needed if the file has several.
-    interval : time between frames, for an NPZ file without times.
+    frame_rate : frames per unit of time, for a table that counts frames, and for an NPZ file without times.
+    columns : name or number of columns of a table, by track, time, x, y, z, u, v, w; numbers count from 1. Columns that
+        are not given are recognised by their names, or by those that tracking programs write.
 
     Raises:
         ProductError: the file is missing or cannot be read, has another layout, lacks values, holds values that are
             not finite, or holds a track twice at one time.
     """
     path = Path(path)
-    if not path.is_file():
+    files = matching_files(path)
+    if not files:
         raise ProductError(f"{path}: no such file; give the path of a file with particle tracks")
     try:
         with read_errors(path):
-            layout = layout or _layout_of(path)
+            layout = layout or _layout_of(max(files, key=lambda file: file.stat().st_size))
             if layout not in LAYOUTS:
                 raise ProductError(f"{path}: layout = {layout!r}: must be one of {', '.join(LAYOUTS)}")
-            found = LAYOUTS[layout](path, group, interval)
+            if layout == "csv":
+                found = Tracks(*read_table(path, columns, frame_rate))
+            elif len(files) > 1:
+                raise ProductError(f"{path}: names {len(files)} files, but only tables may be several; give one file")
+            elif columns:
+                raise ProductError(f"{path}: has the layout {layout}; columns is for tables only, remove it")
+            elif frame_rate is not None and layout in TIMED:
+                raise ProductError(f"{path}: has the layout {layout}, whose frames have times; remove frame_rate")
+            else:
+                found = READERS[layout](files[0], group, frame_rate)
     except UNREADABLE as error:
         text = " ".join(str(error.args[0] if error.args else error).split())
         raise ProductError(f"{path}: cannot be read as {layout}: {text}") from None
@@ -115,14 +134,23 @@ def write_tracks(path: str | Path, times: Any, ids: Any, positions: Any, velocit
     positions, velocities : (rows, 3); velocities may be None.
     edge : edge of the periodic cube.
 
+    Rows with a masked value are left out.
+
     Raises:
-        ProductError: a value is not finite, the arrays have different numbers of rows, a track appears twice at one
-            time, or the file cannot be written.
+        ProductError: a value is not finite, the edge is not positive, the arrays have different numbers of rows, a
+            track appears twice at one time, or the file cannot be written.
     """
     path = Path(path)
-    columns = {"time": np.asarray(times, float), "track": np.asarray(ids), "position": np.asarray(positions, float),
-               "velocity": None if velocities is None else np.asarray(velocities, float)}
-    tracks = checked(Tracks(**columns, edge=float(edge)), path)
+    if not 0 < edge < math.inf:
+        raise ProductError(f"{path}: edge = {edge}: must be a positive number; give the edge of the periodic cube")
+    given = {"time": times, "track": ids, "position": positions, "velocity": velocities}
+    tracks = Tracks(edge=float(edge), **{
+        name: None if values is None else np.asarray(values, None if name == "track" else float)
+        for name, values in given.items()})
+    masks = [np.ma.getmaskarray(values) for values in given.values() if np.ma.is_masked(values)]
+    if masks:
+        tracks = tracks.chosen(~np.any([mask.reshape(len(mask), -1).any(1) for mask in masks], axis=0))
+    tracks = checked(tracks, path)
     rows = tracks.starts[1:] - tracks.starts[:-1]
     frames, most = len(rows), int(rows.max())
     frame = np.repeat(np.arange(frames), rows)
@@ -147,19 +175,29 @@ def write_tracks(path: str | Path, times: Any, ids: Any, positions: Any, velocit
 
 
 def _layout_of(path: Path) -> str:
-    """Return the layout that the suffix of a file shows. An HDF5 file has the layout "h5md" if it holds /particles,
-    else "lagrangebench"."""
+    """Return the layout that the suffix of a file shows, or its content: that of an HDF5 file, or of a text that begins
+    as a table."""
     suffix = path.suffix.lower()
-    if suffix in (".h5", ".hdf5", ".h5md"):
-        with h5py.File(path) as file:
-            return "h5md" if "particles" in file else "lagrangebench"
     if suffix in SUFFIXES:
         return SUFFIXES[suffix]
+    if suffix in (".h5", ".hdf5", ".h5md") or h5py.is_hdf5(path):
+        with h5py.File(path) as file:
+            if "particles" in file and isinstance(file["particles"], h5py.Group):
+                return "h5md"
+            if (path.parent / METADATA).is_file():
+                return "lagrangebench"
+            if any(name in file for name in ROWS):
+                return "flowtracks"
+            raise ProductError(f"{path}: holds {', '.join(file) or 'nothing'}, but no particles/GROUP/position (H5MD), "
+                               f"no {' or '.join(ROWS)} (flowtracks), and there is no {METADATA} beside it "
+                               "(LagrangeBench); write the tracks as a table, or by eddies.write_tracks")
+    if is_table(path):
+        return "csv"
     raise ProductError(f"{path}: the suffix does not show the layout; give the format (in Python: layout), one of "
                        f"{', '.join(LAYOUTS)}")
 
 
-def _read_h5md(path: Path, group: str | None, interval: float | None) -> Tracks:
+def _read_h5md(path: Path, group: str | None, frame_rate: float | None) -> Tracks:
     with h5py.File(path) as file:
         holder = _chosen(path, file.get("particles", {}), group, "groups of particles")
         element = holder["position"]
@@ -192,19 +230,21 @@ def _edges_of(box: h5py.Group) -> np.ndarray:
     return np.unique(edges)
 
 
-def _read_npz(path: Path, group: str | None, interval: float | None) -> Tracks:
+def _read_npz(path: Path, group: str | None, frame_rate: float | None) -> Tracks:
     with np.load(path) as file:
         arrays = {name: file[name] for name in file.files}
     if "pos" not in arrays:
         raise ValueError(f"it holds {', '.join(arrays) or 'nothing'}, but no array pos (frames, particles, 3)")
-    times = arrays.get("time", None if interval is None else interval * np.arange(len(arrays["pos"])))
+    if frame_rate is not None and "time" in arrays:
+        raise ValueError("it holds an array time; remove frame_rate")
+    times = arrays.get("time", None if frame_rate is None else np.arange(len(arrays["pos"])) / frame_rate)
     if times is None:
-        raise ValueError("it holds no array time; give interval, the time between frames")
+        raise ValueError("it holds no array time; give frame_rate, the frames per unit of time")
     return _from_frames(times, arrays["pos"], arrays.get("vel"), arrays.get("rho"))
 
 
-def _read_lagrangebench(path: Path, group: str | None, interval: float | None) -> Tracks:
-    metadata = json.loads((path.parent / "metadata.json").read_text(encoding="utf-8"))
+def _read_lagrangebench(path: Path, group: str | None, frame_rate: float | None) -> Tracks:
+    metadata = json.loads((path.parent / METADATA).read_text(encoding="utf-8"))
     with h5py.File(path) as file:
         position = _chosen(path, file, group, "trajectories")["position"][()]
     lower, upper = np.transpose(metadata["bounds"])
@@ -212,35 +252,19 @@ def _read_lagrangebench(path: Path, group: str | None, interval: float | None) -
     return _from_frames(times, position - lower, edges=np.unique(upper - lower))
 
 
-def _read_csv(path: Path, group: str | None, interval: float | None) -> Tracks:
-    with open(path, encoding="utf-8") as file:
-        heading = file.readline().lstrip("\ufeff#").strip().lower()
-        first = next((line for line in file if line.strip() and not line.lstrip().startswith("#")), "")
-    delimiter = next((mark for mark in ",;\t" if mark in heading), None)
-    names, columns = ([part.strip(' "') for part in line.rstrip().rstrip(delimiter).split(delimiter)]
-                      for line in (heading, re.sub('"[^"]*"', "quoted", first)))
-    if len(columns) == len(names) + 1:  # the first column holds the names of rows, and has no name
-        names = ["", *names]
-    elif first and len(columns) != len(names):
-        raise ValueError(f"the first line names {len(names)} columns, but the first row has {len(columns)}; name each "
-                         "column once")
-    needed = ("track", "time", *AXES)
-    for name in needed:
-        if name not in names:
-            raise ValueError(f"the first line must name the columns {', '.join(needed)}, but it names "
-                             f"{', '.join(names)}; add or correct {name}")
-    wanted = [*needed, *(["u", "v", "w"] if {"u", "v", "w"} <= {*names} else [])]
-    for name in wanted:
-        if names.count(name) > 1:
-            raise ValueError(f"the first line names {names.count(name)} columns {name}; give each column a name of its "
-                             "own (capital letters do not count)")
-    table = np.loadtxt(path, delimiter=delimiter, skiprows=1, usecols=[names.index(name) for name in wanted], ndmin=2,
-                       quotechar='"')
-    return Tracks(table[:, 1], table[:, 0], table[:, 2:5], table[:, 5:] if len(wanted) > 5 else None)
+def _read_flowtracks(path: Path, group: str | None, frame_rate: float | None) -> Tracks:
+    with h5py.File(path) as file:
+        rows = file[next(name for name in ROWS if name in file)]
+        names = list(rows) if isinstance(rows, h5py.Group) else rows.dtype.names
+        velocity = next((name for name in ("vel", "velocity") if name in names), None)
+        found = Tracks(*(None if name is None else rows[name][()].astype(float)
+                         for name in ("time", "trajid", "pos", velocity)))
+    return found if frame_rate is None else replace(found, time=found.time / frame_rate)
 
 
-LAYOUTS: Mapping[str, Callable[[Path, str | None, float | None], Tracks]] = {
-    "h5md": _read_h5md, "npz": _read_npz, "lagrangebench": _read_lagrangebench, "csv": _read_csv}
+READERS: Mapping[str, Callable[[Path, str | None, float | None], Tracks]] = {
+    "h5md": _read_h5md, "npz": _read_npz, "lagrangebench": _read_lagrangebench, "flowtracks": _read_flowtracks}
+LAYOUTS = (*READERS, "csv")  # tables, which may be several files, are read by `read_table`
 # Errors that numpy, h5py and json raise for a file whose content does not fit the layout.
 UNREADABLE = (KeyError, ValueError, TypeError, IndexError, AttributeError, EOFError, BadZipFile, zlib.error)
 
@@ -311,12 +335,14 @@ def checked(tracks: Tracks, path: Path) -> Tracks:
     return sorted_tracks
 
 
-def check_inside(tracks: Tracks, lower: np.ndarray, upper: np.ndarray, key: str, path: str | Path) -> None:
-    """Raise ProductError if positions are outside the region from `lower` to `upper`.
+def check_inside(tracks: Tracks, lower: np.ndarray, upper: np.ndarray, key: str, path: str | Path,
+                 noise: float = 0.0) -> None:
+    """Raise ProductError if positions are outside the region from `lower` to `upper` by more than their noise.
 
     The region or the unit of length is then wrong. `key` is the scene key that gives the region, "box" or "volume".
+    `noise` is the standard deviation of the error of a coordinate.
     """
-    margin = ROUNDING * (upper - lower)
+    margin = ROUNDING * (upper - lower) + OFF * noise
     outside = np.flatnonzero(((tracks.position < lower - margin) | (tracks.position > upper + margin)).any(1))
     if len(outside):
         row, (place, low, high) = outside[0], (", ".join(f"{x:.4g}" for x in point) for point in (

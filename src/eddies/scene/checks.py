@@ -164,7 +164,8 @@ def check_particles(tracers: Tracers, kernel: Kernel | None, model: Model | None
         if reach >= math.pi:  # a particle could interact with two periodic images of another one
             yield f"{name}.neighbors", (
                 f"with {tracers.particles} particles radius and skin together are {reach:.3g}, but must be less than "
-                f"half the cube, {math.pi:.3g}; lower neighbors or raise [tracers] particles_per_side")
+                f"half the cube, {math.pi:.3g}; lower neighbors to less than {neighbors * (math.pi / reach)**3:.3g} "
+                "or raise [tracers] particles_per_side")
 
 
 def check_needs(present: Collection[str], needs_model: bool, has_weights: bool) -> Problems:

@@ -15,6 +15,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
+from eddies.io.file_patterns import matching_files
 from eddies.scene.model import replace_terms
 from eddies.scene.rules import nearest, quoted, shortened
 from eddies.scene.values import SceneError
@@ -168,7 +169,8 @@ def _find_files(document: Document, folder: Path) -> None:
     in the working directory."""
     def found(path: str) -> str:
         beside = os.path.abspath(folder / path)
-        return beside if not os.path.exists(path) and os.path.exists(beside) else path
+        exist = [os.path.exists(each) or bool(matching_files(each)) for each in (path, beside)]
+        return beside if exist == [False, True] else path
 
     for key, value in document.items():
         if isinstance(value, dict):

@@ -48,10 +48,11 @@ class Rule:
     kind : type of the value, or of each entry of a list: float, int, bool or str.
     about : meaning of the key in one line.
     bounds : interval of the allowed numbers.
-    words : allowed strings. If `kind` is a number, they are allowed besides numbers. If `kind` is str and there are no
-        words, any string is allowed.
+    words : allowed strings. If `kind` is a number, they are allowed besides numbers, or in place of a list of numbers.
+        If `kind` is str and there are no words, any string is allowed.
     paths : whether the import path "module:name" of a user's own class is allowed too.
     many : whether the value is a list, held as a tuple.
+    numbered : whether a whole number from 1 on is allowed besides strings.
     """
 
     kind: type
@@ -60,13 +61,14 @@ class Rule:
     words: tuple[str, ...] = ()
     paths: bool = False
     many: bool = False
+    numbered: bool = False
 
     def accept(self, value: Any) -> Any:
         """Return the value in the form in which a section holds it.
 
         Raises ValueError, whose text is a hint or empty, if the value is not allowed.
         """
-        if not self.many:
+        if not self.many or self.kind is not str and isinstance(value, str) and value in self.words:
             return self._accept_one(value)
         if not isinstance(value, (list, tuple)) or self.kind is int and not value:
             raise ValueError
@@ -78,6 +80,8 @@ class Rule:
         words = [quoted(word) for word in self.words]
         if self.kind is bool:
             return "true or false"
+        if self.numbered:
+            return "a string in quotes, or a whole number at least 1"
         if self.kind is str and not words:
             return 'a list of strings, such as ["one", "two"]' if self.many else "a string in quotes"
         if self.kind is str:
@@ -85,11 +89,13 @@ class Rule:
                 f", or {IMPORT_PATH}" if self.paths else "")
         if self.many:
             entries = "[16, 16] of whole numbers" if self.kind is int else "[0.5, 1.5] of numbers"
-            return f"a list such as {entries}, each {self.bounds}".removesuffix(", each ")
+            return " or ".join([f"a list such as {entries}, each {self.bounds}".removesuffix(", each "), *words])
         noun = "a whole number" if self.kind is int else "a number"
         return " or ".join([f"{noun} {self.bounds}".rstrip(), *words])
 
     def _accept_one(self, value: Any) -> Any:
+        if self.numbered and isinstance(value, int) and not isinstance(value, bool) and value >= 1:
+            return value
         if self.kind is str:
             return self._accept_text(value)
         if isinstance(value, bool) != (self.kind is bool):

@@ -424,8 +424,12 @@ def _value(rule: Rule, default: Any) -> dict[str, Any]:
     if rule.kind is not str or not rule.words:
         limits = {LIMITS[name]: bound for name, bound in rule.bounds.given.items()}
         choices.append({"type": TYPES[rule.kind]} | limits)
+    if rule.numbered:
+        choices.append({"type": "integer", "minimum": 1})
     if rule.many:
-        choices = [{"type": "array", "items": choices[0] if len(choices) == 1 else {"anyOf": choices}}]
+        words = choices[:-1] if rule.kind is not str else []  # in place of a list
+        entries = choices[len(words):]
+        choices = [*words, {"type": "array", "items": entries[0] if len(entries) == 1 else {"anyOf": entries}}]
     if default is None:
         choices.append({"const": ABSENT})
     given = {"default": default} if default not in (None, MISSING) else {}

@@ -17,8 +17,8 @@ from eddies.import_path import is_path, load
 from eddies.pipeline import STAGES
 from eddies.scene.integrators import SCHEMES, Scheme
 from eddies.scene.rules import quoted
-from eddies.scene.values import (KeyProblem, SceneError, Section, boolean, choice, expanded, integer, integers, named,
-                                 number, numbers, product_file, section, sections, text, texts)
+from eddies.scene.values import (KeyProblem, SceneError, Section, boolean, choice, column, expanded, integer, integers,
+                                 named, number, numbers, product_file, section, sections, text, texts)
 
 BOX_LENGTH = 2 * math.pi
 DEFAULT_WINDOW = 0.5
@@ -115,6 +115,25 @@ class Initial(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Columns(Section):
+    """Columns of a table of tracks, by name or number; absent ones are recognised by their names."""
+
+    track: str | int | None = column("number or name of the track")
+    time: str | int | None = column("time, or number of the frame")
+    x: str | int | None = column("coordinate x")
+    y: str | int | None = column("coordinate y")
+    z: str | int | None = column("coordinate z")
+    u: str | int | None = column("velocity along x")
+    v: str | int | None = column("velocity along y")
+    w: str | int | None = column("velocity along z")
+
+    @property
+    def given(self) -> dict[str, str | int]:
+        """The columns that are given, by key."""
+        return {key: value for key, value in dataclasses.asdict(self).items() if value is not None}
+
+
+@dataclass(frozen=True, kw_only=True)
 class Tracks(Section):
     """Measured particle tracks, used in place of the direct simulation and its tracers.
 
@@ -123,17 +142,20 @@ class Tracks(Section):
     the tracks that are present in all frames.
     """
 
-    path: str = text("file with the tracks")
+    path: str = text("file with the tracks; * stands for any text in the names of a series of tables")
     format: str | None = choice("layout of the file (docs/tracks.md); absent: found from its name and content", "h5md",
-                                "npz", "lagrangebench", "csv", default=None)
+                                "npz", "lagrangebench", "flowtracks", "csv", default=None)
+    columns: Columns | None = section(Columns, default=None)
     group: str | None = text("name of the particles or of the trajectory in a file with several", default=None)
     box: float | None = number("edge of the periodic cube; absent: that of the file", default=None, above=0)
-    volume: tuple[float, ...] | None = numbers("x0, x1, y0, y1, z0, z1 of a volume that is not periodic, in place of "
-                                               "box", default=None)
+    volume: tuple[float, ...] | str | None = numbers("x0, x1, y0, y1, z0, z1 of a volume that is not periodic, in "
+                                                     "place of box; auto: from the positions", default=None,
+                                                     words=("auto",))
     margin: float | None = number("distance between the volume and its image in the periodic cube around it; absent: "
                                   "four mean spacings", default=None, above=0)
     time_unit: float = number("factor from times of the file to the time unit of its velocities", default=1.0, above=0)
-    interval: float | None = number("time between frames, for an npz file without times", default=None, above=0)
+    frame_rate: float | None = number("frames per unit of time, for files that count frames or have no times",
+                                      default=None, above=0)
     filtered: bool = boolean("whether the particles follow a filtered velocity; false: the unfiltered one",
                              default=False)
     filter_width: float | None = number("width of the Gaussian filter; absent: twice the mean spacing", default=None,
@@ -141,7 +163,11 @@ class Tracks(Section):
     viscosity: float | None = number("kinematic viscosity, for terms that need it", default=None, above=0)
     sound_speed: float | None = number("speed of sound, for terms that need the density; the file must have densities",
                                        default=None, above=0)
-    noise: float = number("standard deviation of the error of a measured coordinate", default=0.0, at_least=0)
+    noise: float | str | None = number("standard deviation of the error of a measured coordinate; auto: estimated; "
+                                       "absent: estimated if the file has no velocities, else 0", default=None,
+                                       words=("auto",), at_least=0)
+    longest_gap: int = integer("largest number of frames that a track may lack; a track is divided at a longer gap",
+                               default=2, at_least=0)
     field_every: int = integer("interval between reconstructed fields, in frames", default=5, at_least=1)
 
     def __post_init__(self) -> None:
@@ -151,7 +177,8 @@ class Tracks(Section):
                 raise self.problem("margin", "this key belongs to volume, which is missing; remove it, or give volume "
                                    "in place of box")
             return
-        if len(self.volume) != 6 or not all(low < high for low, high in zip(self.volume[::2], self.volume[1::2])):
+        if not isinstance(self.volume, str) and (len(self.volume) != 6 or not all(
+                low < high for low, high in zip(self.volume[::2], self.volume[1::2]))):
             raise self.problem("volume", "must be six numbers x0, x1, y0, y1, z0, z1 with x0 < x1, y0 < y1, z0 < z1")
         if self.box is not None:
             raise self.problem("box", "a volume is given too, which is not periodic; remove one of the two")

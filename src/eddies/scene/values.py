@@ -103,9 +103,10 @@ def integers(about: str, default: Any = MISSING, **bounds: float) -> Any:
     return _declare(Rule(int, about, Bounds(**bounds), many=True), default)
 
 
-def numbers(about: str, default: Any = MISSING, **bounds: float) -> Any:
-    """Declare a dataclass field that holds a tuple of real numbers, each within `bounds` (see `Bounds`)."""
-    return _declare(Rule(float, about, Bounds(**bounds), many=True), default)
+def numbers(about: str, default: Any = MISSING, words: tuple[str, ...] = (), **bounds: float) -> Any:
+    """Declare a dataclass field that holds a tuple of real numbers, each within `bounds` (see `Bounds`), or one of
+    `words`."""
+    return _declare(Rule(float, about, Bounds(**bounds), words, many=True), default)
 
 
 def boolean(about: str, default: Any = MISSING) -> Any:
@@ -126,6 +127,11 @@ def named(about: str, *words: str, default: Any = MISSING) -> Any:
 def text(about: str, default: Any = MISSING) -> Any:
     """Declare a dataclass field that holds a string."""
     return _declare(Rule(str, about), default)
+
+
+def column(about: str, default: Any = None) -> Any:
+    """Declare a dataclass field that holds the name of a column, or its number from 1 on."""
+    return _declare(Rule(str, about, numbered=True), default)
 
 
 def texts(about: str, *words: str, default: Any = MISSING, paths: bool = False) -> Any:

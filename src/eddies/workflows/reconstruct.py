@@ -41,6 +41,8 @@ from eddies.workflows.track_solver import (HELD_OUT, NO_FILTER, Method, UniformM
 
 log = logging.getLogger("eddies")
 
+MOST_RADIUS = 0.499 * BOX_LENGTH    # of a kernel: a particle must have one image within it
+
 
 class NeighbourMethod(Method):
     """Reconstructs the velocity at each grid point from the particles around it, and transforms it to modes."""
@@ -223,7 +225,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         filtered = (scene.tracks or tracers).filtered
         grid = solver.grid
         transfer = grid.filter_transfer(tracers.filter_width) if filtered else torch.ones_like(grid.shell)
-        kernel: SmoothingKernel = CubicSpline(tracers.radius_of(NEIGHBORS))
+        kernel: SmoothingKernel = CubicSpline(min(tracers.radius_of(NEIGHBORS), MOST_RADIUS))
         if settings.of_neighbors and scene.kernel is not None and source.truth is not None:
             kernel = load_form(comm, directory / STAGES["train-kernel"].file, source.truth.scales).kernel
         make = (partial(UniformMethod, solver) if source.uniform else

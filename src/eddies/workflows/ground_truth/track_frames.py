@@ -1,6 +1,7 @@
 """Frames of measured tracks in the units of a scene. Splines give missing velocities. Tracks may have gaps."""
 
 import logging
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -8,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from eddies.analysis.track_splines import smooth
+from eddies.analysis.track_splines import NO_NOISE, smooth
 from eddies.clock import SAME
+from eddies.io.file_patterns import FileVersion, file_versions
 from eddies.io.hdf5 import in_files
-from eddies.io.track_files import Tracks, check_inside, check_velocities, checked, read_tracks
+from eddies.io.track_files import OFF, Tracks, check_inside, check_velocities, checked, read_tracks
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import block_starts
 from eddies.scene.scene import BOX_LENGTH, SceneError
@@ -20,6 +22,7 @@ from eddies.scene.sections import Tracks as Settings
 log = logging.getLogger("eddies")
 
 UNEQUAL = 0.01    # largest deviation of a time from equal intervals, divided by the interval
+ROUNDED = 0.75    # the same, divided by the last digit of rounded times: a half, and the error of the fitted interval
 EQUAL = 1e-12     # fraction of a velocity below which velocities are equal
 LEAST_FRAMES = 3
 FITTING = 1.05    # factor by which the noise that tracks show may differ from the given one
@@ -120,47 +123,91 @@ def read_measured(settings: Settings) -> MeasuredTracks:
     If splines are needed, tracks with fewer than three rows are left out. Raises ProductError if the file cannot be
     used, SceneError if it does not fit [tracks], for example with too few frames.
     """
-    state = settings.file.stat() if settings.file.is_file() else None
-    return _read_measured(settings, state and (state.st_size, state.st_mtime_ns))
+    return _read_measured(settings, file_versions(settings.file))
 
 
 @lru_cache(maxsize=1)  # a run reads a file more than once
-def _read_measured(settings: Settings, state: tuple[int, int] | None) -> MeasuredTracks:
-    found = read_tracks(settings.file, settings.format, settings.group, settings.interval)
-    found, edge, volume, corner = _placed(found, settings)
+def _read_measured(settings: Settings, versions: tuple[FileVersion, ...]) -> MeasuredTracks:
+    found = read_tracks(settings.file, settings.format, settings.group, settings.frame_rate,
+                        settings.columns.given if settings.columns else None)
     if settings.sound_speed is not None and found.density is None:
         raise SceneError(f"[tracks] sound_speed = {settings.sound_speed:g}: {settings.file} has no densities; remove "
                          "the key")
+    lower, upper, edge = _region(found, settings)
     period = edge if settings.volume is None else None
-    found = _at_frames(found, settings)
-    if settings.noise == 0:
-        check_velocities(found, period, settings.file)
-    times = found.times
     about: dict[str, Any] = {"file": settings.path, "in_file": len(np.unique(found.track))}
-    position, velocity = found.position, found.velocity
-    if velocity is None or settings.noise > 0:
-        splines = smooth(found.time, found.track, position, period, settings.noise)
-        order = np.argsort(splines.rows)
-        position, velocity = splines.position[order], splines.velocity[order]
-        found = found.chosen(splines.rows[order])
-        about["smoothing"] = splines.smoothing
-        if settings.noise > 0 and not 1 / FITTING < splines.residual / settings.noise < FITTING:
-            log.warning("%s", _noise_misfit(settings, splines.residual))
-        if len(found.times) < len(times):
-            raise SceneError(f"{settings.file}: {len(times) - len(found.times)} of {len(times)} frames have no track "
-                             "with three rows or more, which a velocity needs; give the velocities, or longer tracks")
+    smoothed = found.velocity is None or settings.noise not in (None, 0)
+    measured, interval = _at_frames(found, settings, settings.longest_gap if smoothed else 0)
+    if smoothed:
+        found, noise = _smoothed(measured, period, interval, settings, about)
+    else:
+        check_velocities(measured, period, settings.file)
+        found, noise = measured, 0.0
+    if period is None or not _continuous(measured, period, noise):
+        check_inside(measured, lower, upper, "box" if period else "volume", settings.file, noise)
+    times = interval * np.arange(round(measured.time[-1] / interval) + 1)
+    if len(found.times) < len(times):
+        raise SceneError(f"{settings.file}: {len(times) - len(found.times)} of {len(times)} frames have no track "
+                         "with three rows or more, which a velocity needs; give the velocities, or longer tracks")
     _, place, counts = np.unique(found.track, return_inverse=True, return_counts=True)
-    unit = edge / BOX_LENGTH
-    columns = {"id": found.track, "position": position / unit % BOX_LENGTH, "velocity": velocity / unit}
+    unit, corner = edge / BOX_LENGTH, np.zeros(3) if period else (edge - (upper - lower)) / 2 - lower
+    columns = {"id": found.track, "position": (found.position + corner) / unit % BOX_LENGTH,
+               "velocity": found.velocity / unit}
     if settings.sound_speed is not None:
         columns["density"] = found.density / found.density.mean()
-    spacing = (volume / (len(found.time) / len(times))) ** (1 / 3) / unit
+    spacing = (float(np.prod(upper - lower)) / (len(found.time) / len(times))) ** (1 / 3) / unit
     uniform = _uniform(columns["velocity"], found.starts, times[1])
     if uniform:
         log.warning("%s: all tracks move alike: the velocity field is uniform, and there are no errors relative to "
                     "its fluctuation", settings.file)
     return MeasuredTracks(times, found.starts, columns, uniform, (counts == len(times))[place], spacing,
                           about | {"length_unit": unit, "corner": corner})
+
+
+def _smoothed(found: Tracks, period: float | None, interval: float, settings: Settings,
+              about: dict[str, Any]) -> tuple[Tracks, float]:
+    """Return the tracks with the positions and velocities of splines, and the noise of a coordinate.
+
+    A track that lacks more than [tracks] longest_gap frames is divided there; shorter gaps are filled, unless the
+    tracks have densities. Attributes of the product are added to `about`.
+    """
+    file, given = settings.file, None if settings.noise in (None, "auto") else settings.noise
+    order = np.lexsort((found.time, found.track))
+    same = np.diff(found.track[order]) == 0
+    begins = np.append(False, same & (np.diff(found.time[order]) > (settings.longest_gap + 1.5) * interval))
+    track = found.track.copy()
+    # A part after a gap gets a number of its own.
+    parts = np.cumsum(begins)
+    later = parts > np.maximum.accumulate(np.where(np.append(True, ~same), parts, 0))
+    track[order[later]] = track.max() + parts[later]
+    splines = smooth(found.time, track, found.position, period, given, None if found.density is not None else interval)
+    order = np.lexsort((splines.track, splines.time))
+    rows = splines.rows[order]
+    about["smoothing"], noise = splines.smoothing, given
+    if given is None:
+        noise = 0.0 if splines.smoothing == NO_NOISE else splines.residual
+        log.info("%s: the noise of a coordinate is %s", file, f"about {noise:.2g}, by the residuals of the tracks"
+                 if noise else "too small to be estimated")
+    elif given > 0 and not 1 / FITTING < splines.residual / given < FITTING:
+        log.warning("%s", _noise_misfit(settings, splines.residual))
+    about["noise"] = noise
+    counts = {"tracks are divided at gaps": begins.sum(), "rows are added in gaps": np.sum(rows < 0),
+              "tracks of fewer than three rows are left out": len(np.unique(track)) - len(np.unique(splines.track))}
+    for what, count in counts.items():
+        if count:
+            log.info("%s: %d %s", file, count, what)
+    return Tracks(np.rint(splines.time[order] / interval) * interval, splines.track[order], splines.position[order],
+                  splines.velocity[order], None if found.density is None else found.density[rows]), noise
+
+
+def _continuous(found: Tracks, edge: float, noise: float) -> bool:
+    """Return whether positions are those of tracks that leave a periodic cube and go on: they start within a cube of
+    this edge, at any place, and do not jump."""
+    first = np.unique(found.track, return_index=True)[1]
+    order = np.lexsort((found.time, found.track))
+    moved = np.abs(np.diff(found.position[order], axis=0))[np.diff(found.track[order]) == 0]
+    return bool((np.ptp(found.position[first], axis=0) <= edge + 2 * OFF * noise).all()
+                and moved.max(initial=0.0) < edge / 2)
 
 
 def _uniform(velocity: np.ndarray, starts: np.ndarray, interval: float) -> bool:
@@ -182,49 +229,83 @@ def _noise_misfit(settings: Settings, shown: float) -> str:
             "velocities are those of parabolas; lower noise if tracks are not parabolas")
 
 
-def _at_frames(found: Tracks, settings: Settings) -> Tracks:
-    """Return the tracks with the times 0, h, 2 h, ..., in the time unit of the velocities. The frame interval h is
-    rounded to six digits.
+def _at_frames(found: Tracks, settings: Settings, longest_gap: int) -> tuple[Tracks, float]:
+    """Return the tracks with the times 0, h, 2 h, ..., in the time unit of the velocities, and h. The frame interval h
+    is rounded to six digits.
 
-    Raises SceneError for too few frames, unequal intervals or a frame without tracks.
+    Raises SceneError for too few frames, unequal intervals, or more than `longest_gap` frames without tracks.
     """
-    path, gaps = settings.file, np.diff(found.times)
-    gaps = gaps[gaps > SAME * gaps.max(initial=0.0)]
-    if len(gaps) + 1 < LEAST_FRAMES:
-        raise SceneError(f"{path}: has {len(gaps) + 1} frames; at least {LEAST_FRAMES} are needed")
-    last = round((found.time[-1] - found.time[0]) / float(np.median(gaps)))
-    interval = (found.time[-1] - found.time[0]) / last
-    frame = np.rint((found.time - found.time[0]) / interval)
-    off = np.abs(found.time - found.time[0] - frame * interval)
-    if off.max() > UNEQUAL * interval:
+    path, times = settings.file, found.times
+    if len(times) >= LEAST_FRAMES:
+        times, interval = _frames_of(found)
+    if len(times) < LEAST_FRAMES:
+        raise SceneError(f"{path}: has {len(times)} frames; at least {LEAST_FRAMES} are needed")
+    lacking = np.rint(np.diff(times) / interval).astype(int) - 1
+    gaps = np.flatnonzero(lacking > longest_gap)
+    if len(gaps):
+        count, first = lacking[gaps[0]], times[gaps[0]] + interval
+        until = f" to {times[gaps[0] + 1] - interval:g}" if count > 1 else ""
+        remedy = "" if count > settings.longest_gap else ', or set noise = "auto", so that splines fill the gaps'
+        raise SceneError(f"{path}: no track is there at time {first:g}{until} ({count} frames; {len(gaps)} such gaps "
+                         f"in all), so the file has a gap or several recordings; give a part without gaps{remedy}")
+    numbers = np.cumsum(np.append(0, lacking + 1))
+    interval, origin = (times[-1] - times[0]) / numbers[-1], times[0]
+    rounding = _rounding(times, interval)
+    if rounding > 0:
+        interval, origin = np.polyfit(numbers, times, 1)
+    frame = np.rint((found.time - origin) / interval)
+    off = np.abs(found.time - origin - frame * interval)
+    if off.max() > max(UNEQUAL * interval, ROUNDED * rounding):
         raise SceneError(f"{path}: frames at equal intervals are needed, but the frame at time "
                          f"{found.time[np.argmax(off)]:g} does not fit the interval {interval:g}; interpolate the "
                          "tracks to equal intervals")
-    missing = np.setdiff1d(np.arange(last), frame)
-    if len(missing):
-        raise SceneError(f"{path}: no track is there at time {found.time[0] + missing[0] * interval:g} ({len(missing)} "
-                         "such frames in all); give a part of the file without such a gap")
-    return checked(replace(found, time=frame * float(f"{interval * settings.time_unit:.6g}")), path)
+    if off.max() > UNEQUAL * interval:
+        log.info("%s: times are rounded to %g; frames are at equal intervals of %.6g", path, rounding, interval)
+    interval = float(f"{interval * settings.time_unit:.6g}")
+    return checked(replace(found, time=(frame - frame.min()) * interval), path), interval
 
 
-def _placed(found: Tracks, settings: Settings) -> tuple[Tracks, float, float, np.ndarray]:
-    """Place the tracks in a periodic cube.
+def _frames_of(found: Tracks) -> tuple[np.ndarray, float]:
+    """Return the times of the frames, in the time of the file, and their mean interval. Times that differ by less than
+    half of the median step along tracks are those of one frame."""
+    order = np.lexsort((found.time, found.track))
+    steps = np.diff(found.time[order])[np.diff(found.track[order]) == 0]
+    step = float(np.median(steps if len(steps) else np.diff(found.times)))
+    first = np.append(0, np.flatnonzero(np.diff(found.times) > step / 2) + 1)
+    times = np.add.reduceat(found.times, first) / np.diff(np.append(first, len(found.times)))
+    gaps = np.diff(times)
+    return times, float(np.mean(gaps[gaps <= 1.5 * step * (1 + SAME)])) if len(gaps) else step
 
-    Returns the tracks with their new positions, the edge of the cube, the measured volume, and the position that the
-    origin of the file's coordinates has in the cube. If the measured volume is not periodic, it lies in the middle of a
-    larger cube, at least [tracks] margin away from its periodic images.
+
+def _rounding(times: np.ndarray, interval: float) -> float:
+    """Return the largest power of ten, at most half of the interval, of which all times are multiples; 0 if there is
+    none above 1e-9 of the interval."""
+    largest = math.floor(math.log10(interval / 2))
+    units = (10.0**power for power in range(largest, largest - 9, -1))
+    return next((unit for unit in units if np.abs(times / unit - np.rint(times / unit)).max() < SAME), 0.0)
+
+
+def _region(found: Tracks, settings: Settings) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the lower and upper corner of the measured volume or the periodic box, in the coordinates of the file, and
+    the edge of the periodic cube.
+
+    A measured volume that is not periodic lies in the middle of a larger cube, at least [tracks] margin away from its
+    periodic images.
     """
     if settings.volume is None:
         edge = settings.box if settings.box is not None else found.edge
         if edge is None:
             raise SceneError("[tracks] box: this key is missing, and the file has no periodic cubic box; give "
-                             "the edge of the periodic cube, or the volume of the measurement")
-        check_inside(found, np.zeros(3), np.full(3, edge), "box", settings.file)
-        return found, edge, edge**3, np.zeros(3)
-    lower, upper = np.reshape(settings.volume, (3, 2)).T
-    check_inside(found, lower, upper, "volume", settings.file)
-    whole = float(np.prod(upper - lower))
-    spacing = (whole / (len(found.time) / len(found.times))) ** (1 / 3)
-    edge = float((upper - lower).max()) + (MARGIN * spacing if settings.margin is None else settings.margin)
-    corner = (edge - (upper - lower)) / 2 - lower
-    return replace(found, position=found.position + corner), edge, whole, corner
+                             'the edge of the periodic cube, or the volume of the measurement, such as volume = "auto"')
+        return np.zeros(3), np.full(3, edge), edge
+    if settings.volume == "auto":
+        lower, upper = found.position.min(0), found.position.max(0)
+        log.info("%s: volume = [%s]", settings.file, ", ".join(f"{x:.6g}" for x in np.ravel([lower, upper], "F")))
+        if not (lower < upper).all():
+            raise SceneError(f'[tracks] volume = "auto": {settings.file} has the same '
+                             f"{'xyz'[int(np.argmin(upper - lower))]} in all rows; give volume as six numbers")
+    else:
+        lower, upper = np.reshape(settings.volume, (3, 2)).T
+    spacing = (float(np.prod(upper - lower)) / (len(found.time) / len(found.times))) ** (1 / 3)
+    margin = MARGIN * spacing if settings.margin is None else settings.margin
+    return lower, upper, float((upper - lower).max()) + margin

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from eddies.import_path import origins
+from eddies.io.file_patterns import FileVersion, file_versions
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene, Tracers
 from eddies.scene.sections import SET_KEYS
@@ -96,14 +97,18 @@ def _fingerprints(paths: Sequence[Path]) -> list[str | None]:
 
 
 def _digest(path: str | Path | None) -> str | None:
-    """Return the SHA-256 checksum of a file's content; None if there is no such file."""
-    if path is None or not Path(path).is_file():
-        return None
-    state = Path(path).stat()
-    return _digest_of_version(path, state.st_size, state.st_mtime_ns)
+    """Return the SHA-256 checksum of a file's content; None if there is no such file. That of a series of files, which
+    a path with * names, is of their names too, because these may give the order."""
+    versions = file_versions(path) if path is not None else ()
+    return _digest_of_versions(versions) if versions else None
 
 
-@lru_cache(maxsize=4)  # the file may be large, and a run asks several times
-def _digest_of_version(path: str | Path, size: int, modified: int) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+@lru_cache(maxsize=4)  # the files may be large, and a run asks several times
+def _digest_of_versions(versions: tuple[FileVersion, ...]) -> str:
+    digests = {}
+    for path, *_ in versions:
+        with open(path, "rb") as file:
+            digests[path.name] = hashlib.file_digest(file, "sha256").hexdigest()
+    if len(digests) == 1:
+        return digests[path.name]
+    return hashlib.sha256(json.dumps(digests).encode()).hexdigest()
