@@ -68,7 +68,7 @@ def test_every_variant_is_reported_and_what_they_share_once(comm, capfd):
 
 @pytest.mark.mpi(1)
 def test_every_key_is_described(comm, capfd):
-    described = (Path(__file__).parents[2] / "docs/check.md").read_text(encoding="utf-8")
+    described = (Path(__file__).parents[2] / "docs/commands.md").read_text(encoding="utf-8")
 
     def keys(value):
         for part in value if isinstance(value, list) else [value] if isinstance(value, dict) else []:
