@@ -260,14 +260,25 @@ def key_row(field):
     return f"| `{field.name}` | {default} | {allowed(rule)} | {about} |"
 
 
-def section_rows(name, kind, need=""):
-    """The rows of a section and of its inner sections."""
-    yield f"| **`[{name}]`**{need} | | | *{kind.__doc__.splitlines()[0]}* |"
-    yield from (key_row(key) for key in dataclasses.fields(kind) if "rule" in key.metadata)
+def section_rows(name, kind, need="", shown=None):
+    """The rows of a section and of its inner sections. Keys that an earlier section has shown, a dict of rows and
+    sections, are named only."""
+    shown = {} if shown is None else shown
+    rows = {key.name: key_row(key) for key in dataclasses.fields(kind) if "rule" in key.metadata}
+    known = [key for key, row in rows.items() if row in shown]
+    about = kind.__doc__.splitlines()[0]
+    if known:
+        (section,) = {shown[rows[key]] for key in known}
+        about += f" {', '.join(f'`{key}`' for key in known)}: as in `[{section}]`."
+    yield f"| **`[{name}]`**{need} | | | *{about}* |"
+    yield from (row for row in rows.values() if row not in shown)
     yield from inner_rows(kind, f"{name}.")
     if kind is Model:
+        terms = {}
         for word in TERMS:
-            yield from section_rows(f"model.{word}", settings_class(word))
+            yield from section_rows(f"model.{word}", settings_class(word), shown=terms)
+            terms |= {key_row(key): terms.get(key_row(key), f"model.{word}")
+                      for key in dataclasses.fields(settings_class(word)) if "rule" in key.metadata}
     if kind is Tracers:
         yield f"| **`[tracers.NAME]`**, optional | | | *A set of tracers; keys: {', '.join(SET_KEYS)}.* |"
 
@@ -326,25 +337,30 @@ def test_every_term_is_in_the_table():
     assert set(named) == {*TERMS, '"module:name"'}
 
 
+def rows_of(name):
+    """The rows of a table in docs, which has no empty cells."""
+    with open(CHECKOUT / "docs" / name, encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert all(all(row.values()) for row in rows)
+    return rows
+
+
 def test_every_guarantee_names_tests_that_exist():
-    with open(CHECKOUT / "docs/guarantees.csv", encoding="utf-8", newline="") as file:
-        guarantees = list(csv.DictReader(file))
+    guarantees = rows_of("guarantees.csv")
     assert len(guarantees) > 50
     for row in guarantees:
-        assert all(row.values())
         for test in row["tests"].split():
             path, name = test.split("::")
             assert f"\ndef {name}(" in (CHECKOUT / "tests" / path).read_text(), test
 
 
 def test_functions_of_the_equations_exist():
-    page = (CHECKOUT / "docs/structure.md").read_text()
-    named = re.findall(r"`(\S+)\.py`: (`[\w.]+`(?:, `[\w.]+`)*)", page)
-    assert len(named) > 15
-    for path, names in named:
-        module = import_module(f"eddies.{path.replace('/', '.')}")
-        for name in re.findall(r"[\w.]+", names):
-            assert attrgetter(name)(module), (path, name)
+    equations = rows_of("equations.csv")
+    assert len(equations) > 15
+    for row in equations:
+        for function in row["functions"].split():
+            module, name = function.split(":")
+            assert attrgetter(name)(import_module(f"eddies.{module}")), function
 
 
 def test_constants_of_the_resolved_velocity_are_those_of_the_code():
