@@ -1,6 +1,11 @@
 """How Sphinx makes the site of these pages: .venv/bin/sphinx-build -W docs site."""
 
 import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
 
 import eddies
 from docutils import nodes
@@ -43,13 +48,24 @@ def as_list(app, what, name, obj, options, lines):
     lines[:] = text.split("\n")
 
 
+def add_sample_report(app, exception):
+    """Put the report of the scene tiny beside the pages, unless it is there or no HTML is written."""
+    target = Path(app.outdir, "sample-report.html")
+    if exception is None and app.builder.format == "html" and not target.exists():
+        with tempfile.TemporaryDirectory() as folder:
+            run = Path(folder, "tiny")
+            subprocess.run([sys.executable, "-m", "eddies", "run", "tiny", "--quiet", "--output", run], check=True)
+            shutil.copy(run / "report/index.html", target)
+
+
 def setup(app):
-    """Add lists of parameters and the renderer of formulas."""
+    """Add lists of parameters, the renderer of formulas, and a report."""
     def math(display):
         def visit(translator, node):
             translator.body.append(convert(node.astext(), display=display))
             raise nodes.SkipNode
         return visit, None
 
+    app.connect("build-finished", add_sample_report)
     app.connect("autodoc-process-docstring", as_list, priority=400)  # before napoleon
     app.add_html_math_renderer("mathml", math("inline"), math("block"))

@@ -74,7 +74,7 @@ def figure_3(numbers: dict[str, dict]):
         machs.plot(*np.transpose(found), marker="o", **line)
     delay.plot(training["delay"], training["pressure_gradient"], color=GUIDE, label="exact filtered pressure gradient")
     delay.axvspan(min(training["delay"]), 0, color="#eeeeee")
-    delay.set(xlabel="time after the training window", ylabel="acceleration error", ylim=(0, None),
+    delay.set(xlabel="time after the training interval", ylabel="acceleration error", ylim=(0, None),
               title="flow of the training")
     machs.set(xlabel="$M_t$", ylim=(0, None), title="unseen flows, mean over time")
     centres = (BEFORE[1:] + BEFORE[:-1]) / 2

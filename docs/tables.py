@@ -1,14 +1,15 @@
-"""Writes the tables of README and docs from the results beside this file.
+"""Writes the tables of README and docs, and results/steps.csv, from the results beside this file.
 
     .venv/bin/python docs/tables.py
 
 A table stands between two comments. The first names the comparison in docs/results, the columns, and the rows with the
-words for them; a row `floor` is the truth's own, a row `simulation` has the cost of the direct simulation, and a line
-`*` takes all rows under their names:
+words for them; a row `floor` is the truth's own, and a row `simulation` has the cost of the direct simulation. A row
+`heads` first gives the head of the words; words of several cells are separated by ` | `:
 
     <!-- table of compare-small: wall_seconds velocity_error_half
-    learned: the default
-    floor: two samples of the true particles
+    heads: model | needs
+    learned: the default | pairs
+    floor: two samples of the true particles |
     -->
     <!-- end of table -->
 
@@ -20,6 +21,8 @@ The numbers of a run stand likewise, a row each, taken from its `metrics.json` a
     <!-- end of numbers -->
 """
 
+import csv
+import io
 import json
 import math
 import re
@@ -30,7 +33,7 @@ from typing import Any
 from eddies.measures import MEASURES
 
 HERE = Path(__file__).parent
-PAGES = (HERE.parent / "README.md", *sorted(HERE.glob("*.md")), *sorted(HERE.glob("notes/*.md")))
+PAGES = (HERE.parent / "README.md", *sorted(HERE.glob("*.md")))
 TABLE = re.compile(r"(<!-- table of ([\w-]+): ([^\n]*)\n(.*?)-->\n).*?(?=<!-- end of table -->)", re.DOTALL)
 NUMBERS = re.compile(r"(<!-- numbers of ([\w-]+)\n(.*?)-->\n).*?(?=<!-- end of numbers -->)", re.DOTALL)
 WORDS = MEASURES | {"wall_seconds": "seconds a turnover", "core_seconds": "core seconds a turnover",
@@ -40,7 +43,12 @@ WORDS = MEASURES | {"wall_seconds": "seconds a turnover", "core_seconds": "core 
                     "step_integrator": "integrator", "step_size": "step", "step_seconds": "search (s)",
                     "step_error_twice": "error with twice the step", "step_error": "error",
                     "step_error_half": "with half"}
-FLOOR, SIMULATION = "floor", "simulation"
+HEADS, FLOOR, SIMULATION = "heads", "floor", "simulation"
+# The steps that the search found: comparisons with their rows, and columns of the file.
+STEPS = HERE / "results" / "steps.csv"
+STEPS_OF = "hit-small", "compare-small", "compare-hit", "compare-coarse", "compare-256"
+STEP_COLUMNS = ("step_integrator", "step_size", "step_error_twice", "step_error", "step_error_half", "wall_seconds",
+                "step_seconds")
 
 
 def written(page: str) -> str:
@@ -51,22 +59,40 @@ def written(page: str) -> str:
 
 def table(comparison: str, columns: str, rows: str) -> str:
     """The lines of one table."""
-    record = json.loads((HERE / "results" / f"{comparison}.json").read_text(encoding="utf-8"))
+    record = record_of(comparison)
     results, keys = {row["name"]: row for row in record["rows"]}, columns.split()
     # Any complete row has the floors, which are the truth's.
     results[FLOOR] = {key.removesuffix("_floor"): value for row in record["rows"] for key, value in row.items()
                       if key.endswith("_floor") and value is not None}
     results[SIMULATION] = {"wall_seconds": record.get("simulation_seconds")}
-    lines = ["| |" + "".join(f" {WORDS[key]} |" for key in keys), "|---|" + "---|" * len(keys)]
-    asked = [] if rows.strip() == "*" else [row.split(": ", 1) for row in rows.strip().splitlines()]
-    for name, words in asked or [(row["name"], f"`{row['name']}`") for row in record["rows"]]:
+    asked = [row.split(": ", 1) for row in rows.strip().splitlines()]
+    heads = f" {asked.pop(0)[1]} " if asked[0][0] == HEADS else " "
+    rule = "|---|" + "---|" * (heads.count("|") + len(keys))
+    lines = [f"|{heads}|" + "".join(f" {WORDS[key]} |" for key in keys), rule]
+    for name, words in asked:
         lines.append(f"| {words} |" + "".join(f" {number(results[name], key)} |" for key in keys))
     return "\n".join(lines) + "\n"
 
 
+def steps() -> str:
+    """The lines of the table of all steps."""
+    written = io.StringIO()
+    writer = csv.writer(written, lineterminator="\n")
+    writer.writerow(["scene", "variant", *(WORDS[key] for key in STEP_COLUMNS)])
+    for scene in STEPS_OF:
+        for row in record_of(scene)["rows"]:
+            writer.writerow([scene, row["name"], *(number(row, key) for key in STEP_COLUMNS)])
+    return written.getvalue()
+
+
+def record_of(name: str) -> dict[str, Any]:
+    """What docs/results has under this name."""
+    return json.loads((HERE / "results" / f"{name}.json").read_text(encoding="utf-8"))
+
+
 def numbers(run: str, rows: str) -> str:
     """The lines of the numbers of a run."""
-    record = json.loads((HERE / "results" / f"{run}.json").read_text(encoding="utf-8"))
+    record = record_of(run)
     lines = ["| quantity | value |", "|---|---|"]
     for row in rows.strip().splitlines():
         words, pattern = row.rsplit(" = ", 1)
@@ -101,3 +127,4 @@ if __name__ == "__main__":
         if (new := written(text)) != text:
             path.write_text(new, encoding="utf-8")
             print(path.name)
+    STEPS.write_text(steps(), encoding="utf-8")

@@ -1,17 +1,25 @@
 """README.md and docs say what is true: their commands, scenes, keys, links and code are those of this checkout."""
 
 import contextlib
+import csv
 import dataclasses
 import json
 import re
 import shlex
+import shutil
+import sys
 from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
+from mpi4py import MPI
 
 from eddies.cli import build_parser, main
+from eddies.flow.initial_fields import random_velocity
+from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import BEYOND_DISSIPATION, BEYOND_NYQUIST, LEAST_TRANSFER
 from eddies.particles.resolved_velocity import TOLERANCE, TOLERANCE_PREDICTED, WEIGHT
 from eddies.pipeline import STAGES
@@ -21,11 +29,12 @@ from eddies.scene.rules import quoted
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError, Tracers, builtin_scenes, load_scene
 from eddies.scene.sections import METHODS, SET_KEYS, Simulation
 from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.estimates import estimate, most_ranks
 from tests.commands import python
 
 CHECKOUT = Path(__file__).parents[1]
-PAGES = [CHECKOUT / "README.md", *(page for pages in ("*.md", "notes/*.md", "notebooks/*.ipynb")
+PAGES = [CHECKOUT / "README.md", *(page for pages in ("*.md", "notebooks/*.ipynb")
                                    for page in sorted((CHECKOUT / "docs").glob(pages)))]
 # Programs of the system that are mentioned; what follows them is not looked at, but for paths.
 OF_THE_SYSTEM = ("module", "export", "source", "python3",
@@ -42,7 +51,7 @@ def text_of(page):
 
 
 README = text_of(PAGES[0])
-TEXT = "\n".join(text_of(page) for page in PAGES if page.stem != "from-1.0")  # which names what was removed
+TEXT = "\n".join(map(text_of, PAGES))
 
 
 def blocks(language):
@@ -65,11 +74,41 @@ EXAMPLES = dict(match.groups() for block in blocks("toml")
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with the example scenes, to work in."""
+    """A folder with the example scenes and their classes, to work in."""
     for name, text in EXAMPLES.items():
         (tmp_path / name).write_text(text, encoding="utf-8")
+    shutil.copy(CHECKOUT / "docs/examples/own_pair_force.py", tmp_path)
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture(scope="module")
+def turbulence():
+    """The velocity of a solenoidal flow on 64^3 points, (component, z, y, x)."""
+    grid = SpectralGrid(SlabDecomposition(MPI.COMM_SELF, BOX_LENGTH, 64))
+    return grid.backward(random_velocity(grid, seed=1, amplitude=1.0, peak_wavenumber=3.0))
+
+
+@pytest.fixture
+def convert(monkeypatch):
+    """A function that stores datasets in a file of a folder and converts this cube as docs/own-flow.md does. It returns
+    the result, (component, z, y, x)."""
+    program = next(code for code in blocks("python") if code.startswith("# convert.py"))
+
+    def converted(folder, name, datasets):
+        if name.endswith(".npz"):
+            np.savez(folder / name, **datasets)
+        else:
+            with h5py.File(folder / name, "w") as file:
+                file.update(datasets)
+        with monkeypatch.context() as patch:
+            patch.chdir(folder)
+            patch.setattr(sys, "argv", ["convert.py", name])
+            exec(compile(program, "convert.py", "exec"), {})
+        with h5py.File(folder / "my-cube.h5") as file:
+            return np.moveaxis(file["velocity_0001"][()], -1, 0)
+
+    return converted
 
 
 def words_of(command):
@@ -110,7 +149,9 @@ def test_command_exists(command, folder):
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("command", dict.fromkeys(
     shlex.join(shlex.split(line, comments=True)) for line in COMMANDS if re.match(r"eddies (scenes|check)", line)))
-def test_cheap_command_runs(comm, command, folder, capfd):
+def test_cheap_command_runs(comm, command, folder, convert, turbulence, capfd):
+    if "my-cube" in command:
+        convert(folder, "cube.npz", dict(zip("uvw", turbulence)))
     assert main(shlex.split(command)[1:]) == 0
     output = capfd.readouterr().out
     warnings = [line for line in output.splitlines() if "warning" in line and not re.search(OF_THE_MACHINE, line)]
@@ -161,9 +202,16 @@ def test_example_scenes_have_all_stages(folder):
         assert scene.name == name and scene.stages == tuple(stage for stage in STAGES if stage not in left_out)
 
 
-def test_the_scene_with_an_own_pair_force_differs_from_the_published_system_in_this_force(folder, monkeypatch):
-    monkeypatch.syspath_prepend(CHECKOUT / "docs/examples")
-    variants = load_scene("my-force.toml").variant
+@pytest.mark.parametrize("file", ["cube.h5", "cube.npz"])
+@pytest.mark.parametrize("axes", ["zyx", "xyz"])
+def test_a_cube_of_any_layout_is_converted(tmp_path, convert, turbulence, file, axes):
+    stored = turbulence if axes == "zyx" else turbulence.transpose(0, 3, 2, 1)
+    for datasets in (dict(zip("uvw", stored)), {"velocity": stored}, {"velocity": np.moveaxis(stored, 0, -1)}):
+        assert np.array_equal(convert(tmp_path, file, datasets), turbulence)
+
+
+def test_the_scene_with_an_own_pair_force_differs_from_the_published_system_in_this_force(folder):
+    variants = load_scene("my-cube-force.toml").variant
     published, own = (variants[name].model.settings for name in ("paper", "mine"))
     assert [*own] == ["PairForce", *[*published][1:]]
     assert all(own[name] == settings for name, settings in published.items() if name != "pairs")
@@ -208,17 +256,29 @@ def key_row(field):
         default = "required"
     else:
         default = "none" if field.default is None else f"`{quoted(field.default)}`"
-    return f"| `{field.name}` | {default} | {allowed(rule)} | {rule.about} |".replace("|k|", r"\|k\|")
+    about = rule.about.replace("|", r"\|")
+    return f"| `{field.name}` | {default} | {allowed(rule)} | {about} |"
 
 
-def section_rows(name, kind, need=""):
-    """The rows of a section and of its inner sections."""
-    yield f"| **`[{name}]`**{need} | | | *{kind.__doc__.splitlines()[0]}* |"
-    yield from (key_row(key) for key in dataclasses.fields(kind) if "rule" in key.metadata)
+def section_rows(name, kind, need="", shown=None):
+    """The rows of a section and of its inner sections. Keys that an earlier section has shown, a dict of rows and
+    sections, are named only."""
+    shown = {} if shown is None else shown
+    rows = {key.name: key_row(key) for key in dataclasses.fields(kind) if "rule" in key.metadata}
+    known = [key for key, row in rows.items() if row in shown]
+    about = kind.__doc__.splitlines()[0]
+    if known:
+        (section,) = {shown[rows[key]] for key in known}
+        about += f" {', '.join(f'`{key}`' for key in known)}: as in `[{section}]`."
+    yield f"| **`[{name}]`**{need} | | | *{about}* |"
+    yield from (row for row in rows.values() if row not in shown)
     yield from inner_rows(kind, f"{name}.")
     if kind is Model:
+        terms = {}
         for word in TERMS:
-            yield from section_rows(f"model.{word}", settings_class(word))
+            yield from section_rows(f"model.{word}", settings_class(word), shown=terms)
+            terms |= {key_row(key): terms.get(key_row(key), f"model.{word}")
+                      for key in dataclasses.fields(settings_class(word)) if "rule" in key.metadata}
     if kind is Tracers:
         yield f"| **`[tracers.NAME]`**, optional | | | *A set of tracers; keys: {', '.join(SET_KEYS)}.* |"
 
@@ -238,8 +298,24 @@ def test_scene_reference():
     assert marked("scene reference").splitlines() == rows
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_row_of_a_table_has_the_columns_of_its_head(page):
+    """A bar within a cell would move the text behind it out of the table."""
+    for table in re.findall(r"(?:^\|.*\n)+", text_of(page), re.MULTILINE):
+        head, rule, *rows = table.splitlines()
+        assert re.fullmatch(r"\|( *:?---+:? *\|)+", rule), head
+        columns = {len(re.findall(r"(?<!\\)\|", row)) for row in (head, rule, *rows)}
+        assert len(columns) == 1, head
+
+
+def test_only_the_scene_of_the_text_sets_a_step():
+    scenes = {name: load_scene(name).simulation for name, _ in builtin_scenes()}
+    assert [name for name, simulation in scenes.items() if simulation and simulation.step != "converged"] == ["cbc"]
+    assert "Of the built-in scenes only `cbc` sets a step." in TEXT
+
+
 @pytest.mark.parametrize("words, default, heading", [
-    (PRESETS, DEFAULT_PRESET, "| preset | terms | density |"),
+    (PRESETS, DEFAULT_PRESET, "| preset | equation | needs |"),
     (METHODS, Simulation.__dataclass_fields__["method"].default, "| `method` | what moves the particles |"),
 ])
 def test_a_table_explains_every_choice(words, default, heading):
@@ -249,7 +325,7 @@ def test_a_table_explains_every_choice(words, default, heading):
 
 
 def test_table_of_presets_lists_their_terms():
-    table = TEXT.split("| preset | terms |")[1].split("\n\n")[0]
+    table = TEXT.split("| preset | equation |")[1].split("\n\n")[0]
     for preset, terms in PRESETS.items():
         (listed,) = re.findall(rf"^\| `{re.escape(preset)}`[^|]*\|([^|]*)\|", table, re.MULTILINE)
         assert re.findall(r"`([a-z-]+)`", listed) == list(terms)
@@ -261,24 +337,30 @@ def test_every_term_is_in_the_table():
     assert set(named) == {*TERMS, '"module:name"'}
 
 
+def rows_of(name):
+    """The rows of a table in docs, which has no empty cells."""
+    with open(CHECKOUT / "docs" / name, encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert all(all(row.values()) for row in rows)
+    return rows
+
+
 def test_every_guarantee_names_tests_that_exist():
-    table = TEXT.split("| guarantee | tests |")[1].split("\n\n")[0]
-    guarantees = [row.strip("|").split("|") for row in table.splitlines()[2:] if not row.startswith("| **")]
-    for guarantee, tests in guarantees:
-        named = re.findall(r"`([\w/]+\.py)::(\w+)`", tests)
-        assert named and len(named) == tests.count("`") / 2, guarantee
-        for path, name in named:
-            assert f"\ndef {name}(" in (CHECKOUT / "tests" / path).read_text(), f"{path}::{name}"
+    guarantees = rows_of("guarantees.csv")
+    assert len(guarantees) > 50
+    for row in guarantees:
+        for test in row["tests"].split():
+            path, name = test.split("::")
+            assert f"\ndef {name}(" in (CHECKOUT / "tests" / path).read_text(), test
 
 
 def test_functions_of_the_equations_exist():
-    page = (CHECKOUT / "docs/structure.md").read_text()
-    named = re.findall(r"`(\S+)\.py`: (`[\w.]+`(?:, `[\w.]+`)*)", page)
-    assert len(named) > 15
-    for path, names in named:
-        module = import_module(f"eddies.{path.replace('/', '.')}")
-        for name in re.findall(r"[\w.]+", names):
-            assert attrgetter(name)(module), (path, name)
+    equations = rows_of("equations.csv")
+    assert len(equations) > 15
+    for row in equations:
+        for function in row["functions"].split():
+            module, name = function.split(":")
+            assert attrgetter(name)(import_module(f"eddies.{module}")), function
 
 
 def test_constants_of_the_resolved_velocity_are_those_of_the_code():
@@ -287,7 +369,7 @@ def test_constants_of_the_resolved_velocity_are_those_of_the_code():
 
     angle = {name: f"{scheme.angle:g}" for name, scheme in SCHEMES.items()}
     assert WEIGHT == 100
-    page = " ".join(text_of(CHECKOUT / "docs/closure.md").split())
+    page = " ".join(text_of(CHECKOUT / "docs/methods.md").split())
     for words in (f"the lowest of {BEYOND_NYQUIST:g} k_N, {BEYOND_DISSIPATION:g}/η, and the wavenumber at which the "
                   f"filter leaves {LEAST_TRANSFER:g}", "σ² is 100 times the energy that the prior expects beyond k_c",
                   f"a residual of {power(TOLERANCE_PREDICTED)} of the velocities' rms; without a forecast at "
@@ -299,10 +381,12 @@ def test_constants_of_the_resolved_velocity_are_those_of_the_code():
         text_of(CHECKOUT / "docs/how-it-works.md").split())
 
 
-def test_formulas_shown_are_those_of_the_library():
-    source = (CHECKOUT / "src/eddies/kernels/summands.hpp").read_text()
-    shown = blocks("cpp")
-    assert shown and all(block.strip() in source for block in shown)
+def test_formulas_and_examples_shown_are_those_of_the_files():
+    for language, start, path in (("cpp", "", "src/eddies/kernels/summands.hpp"),
+                                  ("python", "@dataclass", "docs/examples/own_pair_force.py")):
+        source = (CHECKOUT / path).read_text(encoding="utf-8")
+        shown = [block for block in blocks(language) if block.startswith(start)]
+        assert shown and all(block.strip() in source for block in shown)
 
 
 def test_example_with_variants(tmp_path):

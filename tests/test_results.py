@@ -14,18 +14,19 @@ RECORD = {"rows": [
      "wall_seconds": 0.0689}]}
 PAGE = """before
 <!-- table of own: wall_seconds velocity_error_half energy_ratio qr_kl
-one: the **first**
-two: 2: another
-floor: samples
+heads: model | needs
+one: the **first** | pairs
+two: 2: another |
+floor: samples |
 -->
 {}<!-- end of table -->
 after
 """
-LINES = """| | seconds a turnover | velocity error at T/2 | energy, model / truth | KL Q–R |
-|---|---|---|---|---|
-| the **first** | 130 | 0.021 ± 0.003 | 0.996 | 1.5e-05 |
-| 2: another | 0.069 |  |  | 0 |
-| samples |  |  |  | 0.025 |
+LINES = """| model | needs | seconds a turnover | velocity error at T/2 | energy, model / truth | KL Q–R |
+|---|---|---|---|---|---|
+| the **first** | pairs | 130 | 0.021 ± 0.003 | 0.996 | 1.5e-05 |
+| 2: another | | 0.069 |  |  | 0 |
+| samples | |  |  |  | 0.025 |
 """
 
 
@@ -44,6 +45,7 @@ def test_every_table_is_that_of_its_results(tables):
         assert tables.written(text) == text, f"{page.name}: .venv/bin/python docs/tables.py"
         assert text.count("<!-- table of ") == len(tables.TABLE.findall(text))
         assert text.count("<!-- numbers of ") == len(tables.NUMBERS.findall(text))
+    assert tables.STEPS.read_text(encoding="utf-8") == tables.steps(), ".venv/bin/python docs/tables.py"
 
 
 def test_numbers_of_a_run_are_those_of_its_metrics(tables, tmp_path, monkeypatch):

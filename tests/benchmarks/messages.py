@@ -5,7 +5,7 @@
 Open MPI counts what each rank sends to each other one (its component pml_monitoring). Collective operations count as
 the messages of which they consist. The difference between a job of four and one of two steps leaves out the start.
 Writes a row `messages` for each model and number of ranks into the file, the largest count over ranks and the mean, and
-prints the table of docs/performance.md.
+prints them as a table.
 """
 
 import argparse

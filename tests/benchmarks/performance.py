@@ -12,8 +12,8 @@ table of seconds per evaluation. It leaves out models that the file does not hol
 
 `project` measures nothing: seconds of a call and of a unit of work of each part follow from the measured evaluations of
 16^3 and 64^3 particles on one core; messages and bytes from those counted on up to eight ranks, on an assumed network.
-It writes the rows `projected` into the file, and prints the table of docs/performance.md and the deviation of the
-projection from the measurements.
+It writes the rows `projected` into the file, and prints them as a table, and the deviation of the projection from the
+measurements.
 """
 
 import argparse
@@ -255,7 +255,7 @@ def deviations(found: dict) -> dict[int, float]:
 
 
 def table_of_cores(found: dict) -> str:
-    """The table of docs/performance.md: seconds by cores."""
+    """The projected seconds as a table: a row for each number of cores."""
     lines = ["| cores |" + "|".join(f" {side}³ " for side in PROJECTED) + "|", "|---" * (1 + len(PROJECTED)) + "|"]
     for cores in TABLE_CORES:
         cells = [next((f" {row['ranks']} x {row['threads']}: {row['seconds']:.2g} s, {row['binds']} "

@@ -129,7 +129,7 @@ def test_pairs_outside_the_training_data_are_counted(run_directory):
 
 def test_weights_that_come_along_are_as_good_as_their_card_says(run_directory, linked, tmp_path):
     """On a flow that differs only by round-off from that of the training."""
-    page = (Path(__file__).parents[2] / "docs/training.md").read_text()
+    page = (Path(__file__).parents[2] / "docs/comparing.md").read_text()
     card = {name: float(error) for name, error in re.findall(r"^\| `(eddies:.+?)` \|.*\| ([\d.]+) \|$", page, re.M)}
     assert list(card) == built_in_weights()
     for name, error in card.items():

@@ -123,7 +123,7 @@ def test_steps_that_are_too_long_for_a_forced_rollout_or_for_a_term(comm, warned
         given = [*changes, f"simulation.integrator={integrator}", f"simulation.step={step}"]
         lines = problems_of(one_model("hit", given), comm)[1]
         assert any("the noise of the particles, which" in line for line in lines) is expected
-    # The limits of docs/local.md, in units of d/u', for C_r = 1.
+    # The limits of docs/methods.md, in units of d/u', for C_r = 1.
     for integrator, limit in (("corrected-verlet", 0.18), ("rk3", 0.22)):
         units = StepUnits(radius=1.5, filter_width=1.0, sound_speed=None, velocity=1.0, scheme=SCHEMES[integrator])
         assert FilteredEquations().longest_step(units) == pytest.approx(limit, rel=0.05)

@@ -12,7 +12,7 @@ from eddies.parallel.reduction import global_sum
 
 # Three upper limits of the highest wavenumber that particles resolve: BEYOND_NYQUIST times their Nyquist wavenumber;
 # BEYOND_DISSIPATION / eta, where the spectrum ends; and the wavenumber at which the filter's transfer function falls to
-# LEAST_TRANSFER, since the closure divides by this function (docs/closure.md).
+# LEAST_TRANSFER, since the closure divides by this function (docs/methods.md).
 BEYOND_NYQUIST, BEYOND_DISSIPATION, LEAST_TRANSFER = 1.5, 1.05, 0.02
 #: Number of cells in the shortest wavelength that the grid of the resolved velocity resolves. Cubic splines can
 #: represent a wave of this length.

@@ -25,11 +25,11 @@ from eddies.spectral.interpolation import margin_for
 from eddies.spectral.mode_operators import gaussian_transfer
 
 # Exponent of the prior's power law, the two constants of its dissipation range (Pope 2000, Eq. 6.248), and the ratio of
-# the noise to the expected unresolved energy. The ratio is measured in docs/closure.md.
+# the noise to the expected unresolved energy. The ratio is measured in docs/methods.md.
 EXPONENT, DISSIPATION, DISSIPATION_ONSET, WEIGHT = 11 / 3, 5.2, 0.4, 100.0
 # Final residuals relative to the velocities, of a solve that starts from zero and of one that starts from a prediction.
 # A solve from zero leaves its residual in poorly determined modes; a solve from a prediction leaves it in all modes. At
-# twice the second value a forced flow diverged (docs/closure.md).
+# twice the second value a forced flow diverged (docs/methods.md).
 TOLERANCE, TOLERANCE_PREDICTED = 2e-4, 1e-3
 # Final residual of the solve in the backward pass, relative to the incoming gradient. Gradients of a loss through four
 # frames then have an error of 2e-3, and the solve takes half as many iterations as with a tolerance of 2e-4.

@@ -10,7 +10,7 @@ class Scheme:
 
     `nodes` and `weights` are the coefficients c and b of a Runge-Kutta scheme; other schemes have none. Each stage of a
     Runge-Kutta scheme starts at the beginning of the step and uses only the rates of the stage before. For `angle` see
-    docs/closure.md.
+    docs/methods.md.
     """
 
     name: str

@@ -50,7 +50,7 @@ class Scene(Section):
     realisations: tuple[int, ...] | None = integers(
         "seeds of further ground truths, which no training uses; rollouts are made on each, from its beginning; an "
         "initial flow of kind file is read from realisation-SEED beside its file; absent: rollouts are made on the "
-        "ground truth of the scene, after the training window", default=None, at_least=0)
+        "ground truth of the scene, after the training interval", default=None, at_least=0)
     device: str = choice("device that computes the particles", "cpu", "cuda", default="cpu")
     tracks: Tracks | None = section(Tracks, default=None)
     flow: Flow = section(Flow, default=None)

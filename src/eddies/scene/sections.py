@@ -502,7 +502,7 @@ CONVERGED = "converged"
 class Simulation(Section):
     """The rollout, in which a method moves the particles without the direct simulation."""
 
-    method: str = named("method that moves the particles; see docs/baselines.md", *METHODS, default="learned")
+    method: str = named("method that moves the particles; see docs/methods.md", *METHODS, default="learned")
     integrator: str | None = choice("time stepping method of the particles; absent: rk3, or with step = \"converged\" "
                                     "the cheapest", *SCHEMES, default=None)
     step: float | str = number("longest time step; converged: the cheapest that has converged, found by short rollouts",
@@ -514,7 +514,7 @@ class Simulation(Section):
         "absent: the realisations of the scene", default=None)
     turnovers: float = number("length of the rollout in large-eddy turnovers", above=0)
     start: float | None = number("start of the rollout as a fraction of the ground truth; absent: the end of the "
-                                 "training window, or the first field of a ground truth without training",
+                                 "training interval, or the first field of a ground truth without training",
                                  default=None, at_least=0, below=1)
     frame_interval: float = number("time between stored frames", above=0)
     skin: float = number("extra reach of the neighbour list, as a fraction of its radius", default=0.1, at_least=0,
@@ -608,7 +608,7 @@ class Eulerian(Section):
                             "particles; filtered: the filtered velocity", *EQUATIONS, default="unfiltered")
     start: str = choice("modes at the start; flow: those of the true flow; particles: a least-squares fit to the "
                         "velocities of the particles", "flow", "particles", default="flow")
-    closure: str = choice("model of the scales that the grid, or the filter, leaves out; see docs/baselines.md",
+    closure: str = choice("model of the scales that the grid, or the filter, leaves out; see docs/methods.md",
                           *CLOSURES, default="none")
     smagorinsky: float = number("C_s of closure smagorinsky, the eddy viscosity (C_s Delta)^2 (2 S:S)^(1/2)",
                                 default=0.17, above=0)

@@ -40,7 +40,7 @@ def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
 
 
 def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
-    """Return all estimates, with the keys that docs/check.md describes. An unknown value is None. All ranks call it."""
+    """Return all estimates, with the keys of docs/check-keys.csv. An unknown value is None. All ranks call it."""
     planned = steps(scene, scene.stages_of_all, scene.directory)
     measured, unfit = measure([scene, *(step.scene for step in planned)], comm)
     refusals, warnings = problems(scene, planned, comm, memory_of_node(comm), free_disk_at(scene.directory, comm),

@@ -206,7 +206,7 @@ def test_the_force_at_particles_that_resolve_their_velocity(comm):
     assert with_stress < 0.02 < 0.1 < without
 
 
-# ---- limits of the form, stated in docs/closure.md
+# ---- limits of the form, stated in docs/methods.md
 
 
 @one_rank
