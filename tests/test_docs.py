@@ -127,7 +127,9 @@ def check_eddies(arguments):
     """The command line is accepted, and its scene passes its checks."""
     options = build_parser().parse_args(arguments)
     if getattr(options, "scene", None):
-        load_scene(options.scene, getattr(options, "overrides", []), getattr(options, "removals", []))
+        in_checkout = options.scene.startswith("docs/")
+        load_scene(CHECKOUT / options.scene if in_checkout else options.scene, getattr(options, "overrides", []),
+                   getattr(options, "removals", []))
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -202,9 +204,10 @@ def test_example_scenes_have_all_stages(folder):
         assert scene.name == name and scene.stages == tuple(stage for stage in STAGES if stage not in left_out)
 
 
+@pytest.mark.mpi(1)
 @pytest.mark.parametrize("file", ["cube.h5", "cube.npz"])
 @pytest.mark.parametrize("axes", ["zyx", "xyz"])
-def test_a_cube_of_any_layout_is_converted(tmp_path, convert, turbulence, file, axes):
+def test_a_cube_of_any_layout_is_converted(comm, tmp_path, convert, turbulence, file, axes):
     stored = turbulence if axes == "zyx" else turbulence.transpose(0, 3, 2, 1)
     for datasets in (dict(zip("uvw", stored)), {"velocity": stored}, {"velocity": np.moveaxis(stored, 0, -1)}):
         assert np.array_equal(convert(tmp_path, file, datasets), turbulence)

@@ -1,43 +1,81 @@
 """Writes the table of the ladder from its run: each rung on the flow of the choice and on those of the test.
 
-    .venv/bin/python docs/ladder/table.py runs/ladder
+    .venv/bin/python docs/ladder/table.py runs/ladder [--seconds]
 
-The first realisation serves the choice, the others the test, whose mean and standard deviation stand in the table. It
-also writes ../results/ladder.json and the figure ../paper/ladder.png: error at T over the cost of a turnover.
+The first realisation serves the choice, the others the test, whose mean and standard deviation stand in the table. With
+`--seconds` the seconds of a turnover are measured, all rungs in turn on one core, else they are those of the last
+measurement. Writes ../results/ladder.json and the figure ../paper/ladder.png: error at T over the cost of a turnover.
 """
 
+import argparse
 import json
-import sys
+import math
+import time
 from pathlib import Path
 
 import numpy as np
+import torch
 from mpi4py import MPI
 
+from eddies.io.hdf5 import open_product, read_attributes
 from eddies.report.figures import GUIDE, LOOKS, panels, png, styled
-from eddies.scene.scene import load_scene
+from eddies.scene.scene import Scene, load_scene
+from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.measure import is_current, read
+from eddies.workflows.rollout.method import TimeStep, make_method
 from eddies.workflows.variants import rollouts
 
 HERE = Path(__file__).parent
-#: The rungs that the line of the figure connects.
-LINE = "paper", "wide", "together", "together-horizons", "local-pairs", "local", "resolved"
+RESULTS, FIGURE = HERE.parent / "results" / "ladder.json", HERE.parent / "paper" / "ladder.png"
+#: The rungs that the line of the figure connects, and those whose names stand beside their points.
+LINE = "paper", "wide", "together", "local", "resolved"
+NAMED = *LINE, "horizons-8", "no-density"
+FRAMES = 6  # of the timing
 COLUMNS = {"acceleration_error": "a priori", "velocity_error_early": "t_η", "velocity_error_half": "T/2",
            "velocity_error_end": "T", "plane_difference": "field at T", "energy_ratio": "energy",
            "spectrum_error": "spectrum", "count_variance": "counts"}
 
 
 def measures_of(directory: Path) -> dict[str, float | None]:
-    """The measures of a rollout; None where it broke off."""
+    """The measures of a rollout, and the time at which it broke off."""
     found, _ = read(directory, MPI.COMM_SELF)
     numbers = found["rollout"] | found["accuracy"]
-    return {name: numbers.get(name) for name in COLUMNS}
+    row = {name: numbers.get(name) for name in COLUMNS}
+    return row if numbers["stable"] else row | {"plane_difference": None, "broken": numbers["turnovers"]}
 
 
-def cell(values: list[float | None]) -> str:
-    """Mean and standard deviation, or how many rollouts broke off."""
-    known = [value for value in values if value is not None]
-    if len(known) < len(values):
-        return f"{len(values) - len(known)} of {len(values)} broke off"
+def step_of(directory: Path, scene: Scene) -> TimeStep:
+    """The integrator and the step of a rollout, the converged ones or those of the scene."""
+    if not scene.simulation.finds_step:
+        return TimeStep(scene.simulation.scheme.name, scene.simulation.longest_step)
+    with open_product(MPI.COMM_SELF, directory / "step.h5", "step") as file:
+        found = read_attributes(file, "found")
+    return TimeStep(found["integrator"], found["size"])
+
+
+@torch.no_grad()
+def seconds_of(scene: Scene, directory: Path, step: TimeStep, truth: Path) -> float:
+    """Seconds of a turnover on one core, from the steps of a few frames; NaN if the rollout breaks off."""
+    with open_truth(MPI.COMM_SELF, truth) as opened:
+        run, interval = make_method(scene, step, opened, 0, directory), scene.simulation.frame_interval
+        began = start = math.nan
+        for frame in range(1, FRAMES + 1):
+            while run.time < frame * interval - 1e-9:
+                if run.advance(frame * interval, 1) is not None:
+                    return math.nan
+            if frame == 1:  # the first steps are no measurement
+                began, start = time.perf_counter(), run.time
+        return (time.perf_counter() - began) / (run.time - start) * opened.reference["eddy_turnover_time"]
+
+
+def cell(rows: list[dict], key: str) -> str:
+    """Mean and standard deviation, or when the rollouts broke off."""
+    broken = [row["broken"] for row in rows if "broken" in row]
+    known = [row[key] for row in rows if row[key] is not None]
+    if key == "velocity_error_end" and broken:
+        return f"{len(broken)} of {len(rows)} break off, after {min(broken):.2g} T"
+    if len(known) < len(rows):
+        return ""
     return f"{np.mean(known):.3g}" + (f" ± {np.std(known, ddof=1):.1g}" if len(known) > 1 else "")
 
 
@@ -48,39 +86,58 @@ def figure(found: dict[str, dict]):
     axis, points = axes[0, 0], {}
     for name, row in found.items():
         errors = [other["velocity_error_end"] for other in row["realisations"][1:]]
-        if None not in errors and row["wall_seconds"]:
-            points[name] = row["wall_seconds"], float(np.mean(errors)), float(np.std(errors, ddof=1))
+        if None not in errors and "seconds" in row:
+            points[name] = row["seconds"], float(np.mean(errors)), float(np.std(errors, ddof=1))
     line = [name for name in LINE if name in points]
     axis.plot(*np.transpose([points[name][:2] for name in line]), color=GUIDE, linewidth=1, zorder=1)
+    free = points.pop("no-force", None)
+    if free is not None:
+        axis.axhline(free[1], color=LOOKS["none"][0], linestyle="--", label="no force")
     for name, (cost, error, spread) in points.items():
-        colour, marker = LOOKS.get("none" if name == "no-force" else name, (GUIDE, "o"))
-        named = name in line or name in LOOKS
-        axis.errorbar(cost, error, spread, color=colour, marker=marker, markersize=6 if named else 4, linewidth=1)
-        if named:
-            axis.annotate(name, (cost, error), xytext=(6, 5), textcoords="offset points", fontsize=9)
+        colour, marker = LOOKS.get(name, ("#444444" if name in NAMED else GUIDE, "o"))
+        axis.errorbar(cost, error, spread, color=colour, marker=marker, markersize=6 if name in NAMED else 4,
+                      linewidth=1, zorder=3 if name in NAMED else 2)
+        if name in NAMED:
+            axis.annotate(name, (cost, error), xytext=(6, 6), textcoords="offset points", fontsize=9)
     axis.errorbar([], [], [], color=GUIDE, marker="o", markersize=4, linestyle="none", label="other rungs (table)")
-    axis.set(xscale="log", xlabel="seconds a turnover", ylabel="velocity error at T", ylim=(0, None))
-    axis.legend()
+    costs = [cost for cost, *_ in points.values()]
+    axis.set(xscale="log", xlim=(0.8 * min(costs), 1.7 * max(costs)), xlabel="seconds a turnover, one core",
+             ylabel="velocity error at T", ylim=(0, None))
+    axis.legend(loc="lower left")
     return drawn
 
 
-def main(directory: Path) -> None:
-    rows = json.loads((directory / "report" / "metrics.json").read_text())["rows"]
-    costs, found = {row["name"]: row for row in rows}, {}
-    for name, runs in rollouts(load_scene(directory / "scene.toml"), directory).items():
-        if all(is_current(run) for run in runs):
-            cost = {key: costs[name][key] for key in ("training_seconds", "time_step", "wall_seconds")}
-            found[name] = cost | {"realisations": [measures_of(run) for run in runs]}
-    (HERE.parent / "results" / "ladder.json").write_text(json.dumps(found, indent=1) + "\n")
-    (HERE.parent / "paper" / "ladder.png").write_bytes(png(figure(found)))
-    print(f"| rung | training (s) | seconds a turnover | T, choice | {' | '.join(COLUMNS.values())} |")
-    print("|---" * (4 + len(COLUMNS)) + "|")
+def main(run: Path, timed: bool) -> None:
+    before = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    scene, found = load_scene(run / "scene.toml"), {}
+    for name, runs in rollouts(scene, run).items():
+        paths, own = [*runs], scene.variant[name]
+        if not all((path / "rollout.h5").exists() and is_current(path) for path in paths):
+            print(f"{name}: left out, its rollouts or their measures are missing")
+            continue
+        step = step_of(run / name, own)
+        row = {"step": step.size, "integrator": step.integrator}
+        if (run / name / "model.h5").exists():
+            row["training_seconds"] = json.loads((run / name / "stage_seconds.json").read_text()).get("train")
+        if timed:
+            row["seconds"] = seconds_of(runs[paths[1]], paths[1], step, paths[1] / "ground_truth.h5")
+        elif "seconds" in before.get(name, {}):
+            row["seconds"] = before[name]["seconds"]
+        found[name] = row | {"realisations": [measures_of(path) for path in paths]}
+    RESULTS.write_text(json.dumps(found, indent=1) + "\n")
+    FIGURE.write_bytes(png(figure(found)))
+    print(f"| rung | seconds a turnover | T, choice | {' | '.join(COLUMNS.values())} |")
+    print("|---" * (3 + len(COLUMNS)) + "|")
     for name, row in found.items():
-        first, *others = row["realisations"]
-        costs_shown = ("" if row[key] is None else f"{row[key]:.3g}" for key in ("training_seconds", "wall_seconds"))
-        print(f"| `{name}` | {' | '.join(costs_shown)} | {cell([first['velocity_error_end']])} | "
-              f"{' | '.join(cell([other[key] for other in others]) for key in COLUMNS)} |")
+        choice, *tests = row["realisations"]
+        seconds = f"{row['seconds']:.2g}" if "seconds" in row and row["seconds"] == row["seconds"] else ""
+        print(f"| `{name}` | {seconds} | {cell([choice], 'velocity_error_end')} | "
+              f"{' | '.join(cell(tests, key) for key in COLUMNS)} |")
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--seconds", action="store_true", help="measure the seconds of a turnover")
+    given = parser.parse_args()
+    main(given.run, given.seconds)
