@@ -4,8 +4,8 @@
 
 Rollouts of trained variants of the ladder over step, Mach number, width of the filter, number of neighbours,
 arrangement of the particles at the start, density, frame of reference, precision and weights; one change at a time.
-Takes half an hour. Flows and further trainings go to runs/stability. Writes stability-map.json and stability-map.png
-to the folder docs/validation, and prints the table.
+Takes an hour; a stopped script goes on. Flows and further trainings go to runs/stability. Writes stability-map.json
+and stability-map.png to the folder docs/validation.
 """
 
 import argparse
@@ -13,8 +13,9 @@ import json
 import math
 import re
 import tempfile
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import h5py
@@ -44,7 +45,7 @@ SPEEDS = {0.01: 195.0, 0.04: 48.8, 0.08: 24.4, 0.16: 12.2, 0.5: 3.9}  # by Mach 
 SIDES = (56, 32, 16, 12, 7)  # particles per side; the filter is two spacings wide
 NEIGHBORS = (8, 20, 150, 300)
 ELSEWHERE = {"paper": "hit-256-paper", "local": "hit-256-local", "resolved": "hit-256"}
-State = dict[str, np.ndarray]
+State, Outcome = dict[str, np.ndarray], dict[str, float | str]
 
 
 class Flow:
@@ -94,7 +95,7 @@ class Flow:
 
 @torch.no_grad()
 def outcome(scene: Scene, weights: Path, flow: Flow, start: State | None = None, step: float = USUAL,
-            frame: np.ndarray | None = None) -> dict[str, float | str]:
+            frame: np.ndarray | None = None) -> Outcome:
     """Error and energy at T/2, or time (in T) and cause of a break-off.
 
     `start` replaces the particles of the truth, and `frame` (3,) is a velocity added to them.
@@ -143,9 +144,9 @@ def arrangements(flow: Flow, seed: int = 5) -> dict[str, np.ndarray]:
             "a quarter in a thousandth": crowd, "pairs at one place": pairs}
 
 
-def made(name: str, *overrides: str, stages: tuple[str, ...] = ("dns",)) -> Path:
-    """Run stages of the scene with changes; the run directory. What is complete is kept."""
-    return eddies.run(load_scene(SCENE, overrides), stages=stages, output=RUNS / name)
+def made(name: str, *overrides: str) -> Path:
+    """Make a ground truth of the scene with changes; the run directory. What is complete is kept."""
+    return eddies.run(load_scene(SCENE, overrides), stages=("dns",), output=RUNS / name)
 
 
 def rounded(weights: Path, place: Path) -> Path:
@@ -162,52 +163,47 @@ def rounded(weights: Path, place: Path) -> Path:
     return place
 
 
-def cases(ladder: Path, chosen: list[str]):
-    """Yield (axis, case, variant, outcome)."""
+def cases(ladder: Path, chosen: list[str]) -> Iterator[tuple[str, str, str, Callable[[], Outcome]]]:
+    """Yield axis, case, variant, and a function that gives the outcome."""
     scene, truth = load_scene(ladder / "scene.toml"), ladder / "realisation-3" / "ground_truth.h5"
     variants = {name: (scene.variant[name], ladder / name / "model.h5") for name in chosen}
     with open_truth(MPI.COMM_SELF, truth) as opened:
         flow = Flow(opened)
-        drift = 30 * flow.scales.velocity * np.array([0.6, -0.48, 0.64])
+        drift, begin = 30 * flow.scales.velocity * np.array([0.6, -0.48, 0.64]), flow.start()
         for name, (own, weights) in variants.items():
-            def usual(*given, **changed):
-                return outcome(own, weights, flow, *given, **changed)
-
+            usual = partial(outcome, own, weights, flow)
             for step in STEPS:
-                yield "step / t_η", f"{step:g}", name, usual(step=step)
+                yield "step / t_η", f"{step:g}", name, partial(usual, step=step)
             for words, position in arrangements(flow).items():
-                yield "start", words, name, usual(flow.at(position))
-            begin = flow.start()
+                yield "start", words, name, partial(usual, flow.at(position))
             for words, density in (("10 % higher", 1.1 * begin["density"]), ("its mean", 0 * begin["density"] + 1)):
-                yield "density at the start", words, name, usual(begin | {"density": density})
-            yield "boost", "30 u′", name, usual(frame=drift)
+                yield "density at the start", words, name, partial(usual, begin | {"density": density})
+            yield "boost", "30 u′", name, partial(usual, frame=drift)
             double = replace(own, simulation=replace(own.simulation, precision="float64"))
-            yield "precision", "double", name, outcome(double, weights, flow)
-            RUNS.mkdir(parents=True, exist_ok=True)
+            yield "precision", "double", name, partial(outcome, double, weights, flow)
             yield ("precision", "weights of half precision", name,
-                   outcome(own, rounded(weights, RUNS / "half.h5"), flow))
+                   lambda: outcome(own, rounded(weights, RUNS / "half.h5"), flow))
             if name in ELSEWHERE:
                 yield ("weights of another flow", ELSEWHERE[name], name,
-                       outcome(own, WEIGHTS / f"{ELSEWHERE[name]}.h5", flow))
-    for axis, flows in (("M_t", {f"{mach:g}": made(f"mach-{mach:g}", f"flow.sound_speed={speed}")
-                                 for mach, speed in SPEEDS.items()}),
-                        ("filter / η", {str(side): made(f"side-{side}", f"tracers.particles_per_side={side}")
-                                        for side in SIDES})):
-        for case, run in flows.items():
-            with open_truth(MPI.COMM_SELF, run / "ground_truth.h5") as opened:
-                flow = Flow(opened)
-                if axis == "filter / η":
-                    case = f"{flow.scales.filter_width / flow.scales.kolmogorov_length:.0f}"
-                for name, (own, weights) in variants.items():
-                    yield axis, case, name, outcome(own, weights, flow)
-    base = made("mach-0.08", "flow.sound_speed=24.4")
+                       partial(outcome, own, WEIGHTS / f"{ELSEWHERE[name]}.h5", flow))
+    for axis, case, *change in ([("M_t", f"{mach:g}", f"flow.sound_speed={speed}") for mach, speed in SPEEDS.items()]
+                                + [("filter", f"{side}³ particles", f"tracers.particles_per_side={side}")
+                                   for side in SIDES]):
+        run = made(f"{axis}-{case.split('³')[0]}", *change)
+        with open_truth(MPI.COMM_SELF, run / "ground_truth.h5") as opened:
+            flow = Flow(opened)
+            if axis == "filter":
+                case = f"{flow.scales.filter_width / flow.scales.kolmogorov_length:.0f} η"
+            for name, (own, weights) in variants.items():
+                yield axis, case, name, partial(outcome, own, weights, flow)
+    base = made("M_t-0.08", f"flow.sound_speed={SPEEDS[0.08]}")
     for name, (own, _) in variants.items():
         if "pairs" in own.model.reads:
             for number in NEIGHBORS:
-                yield "neighbours, trained", str(number), name, with_neighbors(own, name, number, base)
+                yield "neighbours, trained", str(number), name, partial(with_neighbors, own, name, number, base)
 
 
-def with_neighbors(own: Scene, name: str, number: int, base: Path) -> dict[str, float | str]:
+def with_neighbors(own: Scene, name: str, number: int, base: Path) -> Outcome:
     """The outcome of a short training with another number of neighbours, in the flow of the training."""
     place = RUNS / f"{name}-{number}"
     place.mkdir(parents=True, exist_ok=True)
@@ -247,10 +243,15 @@ def figure(found: dict[str, dict[str, dict[str, dict]]], names: list[str]):
 
 
 def main(ladder: Path, chosen: list[str]) -> None:
-    found: dict[str, dict[str, dict[str, dict]]] = {}
-    for axis, case, name, result in cases(ladder, chosen):
-        found.setdefault(axis, {}).setdefault(case, {})[name] = result
-        print(f"{axis}: {case}: {name}: {result}", flush=True)
+    RUNS.mkdir(parents=True, exist_ok=True)
+    known = RUNS / "found.json"
+    found: dict[str, dict[str, dict[str, Outcome]]] = json.loads(known.read_text()) if known.exists() else {}
+    for axis, case, name, compute in cases(ladder, chosen):
+        results = found.setdefault(axis, {}).setdefault(case, {})
+        if name not in results:
+            results[name] = compute()
+            known.write_text(json.dumps(found))  # a stopped script goes on here
+            print(f"{axis}: {case}: {name}: {results[name]}", flush=True)
     (OUTPUT / "stability-map.json").write_text(json.dumps(found, indent=1) + "\n")
     (OUTPUT / "stability-map.png").write_bytes(png(figure(found, chosen)))
 
