@@ -123,7 +123,7 @@ def test_another_flow(execute):
 
 def test_error_against_run_time(execute, folder):
     cells, (front, rows) = execute("error-against-run-time", "[list(front.index), table.to_dict('index')]",
-                                   changes=[*SMALLER, NO_SEARCH], turnovers=0.1)
+                                   changes=[*SMALLER, "flow.cells=24", NO_SEARCH], turnovers=0.1)
     assert set(figures(cells)) == {"front"} and (folder / "runs/cost/report/index.html").exists()
     assert {row["status"] for row in rows.values()} == {"complete"}
     cost, error = ([row[key] for row in rows.values()] for key in ("wall_seconds", "velocity_error_end"))

@@ -51,7 +51,7 @@ def truths(comm, shared_folder):
     return [folder / "still", folder / "moving"]
 
 
-@pytest.mark.usefixtures("quick_spectra", "no_figures")
+@pytest.mark.usefixtures("quick_spectra", "quick_solves", "no_figures")
 @pytest.mark.mpi(2)
 @pytest.mark.parametrize("preset, where", [("paper", "flow"), ("local", "flow"), ("resolved", "flow"),
                                            ("resolved", "particles")])

@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from eddies.analysis.pdfs import bin_centres, bin_edges, gaussian, pdf, standardized
+from eddies.report import learning
 from eddies.report.figures import GUIDE, WIDE, Table, Variant, legend_at_foot, letter, note, panels, styled
-from eddies.report.learning import curves
 from eddies.report.page import Section
 from eddies.report.page import shown as in_words
 
@@ -65,7 +65,7 @@ def section(models: Sequence[Variant]) -> Section:
         sources = {each.numbers["provenance"]["source"]["path"] for each in trained
                    if "source" in each.numbers["provenance"]}
         histories = {each.label: (each.tables["history"], each.look[0]) for each in trained}
-        shown.add_figure("model-training", "Training of the models", lambda: curves(histories), "Losses, and "
+        shown.add_figure("model-training", "Training of the models", lambda: learning.curves(histories), "Losses, and "
                          "validation error." + (f" Trained in {', '.join(sources)}." if sources else ""))
     return shown
 
