@@ -40,7 +40,7 @@ BAD_TEXTS = [
     ('[tracks]\npath = "a.csv"\nvolume = [0, 1]\n', "[tracks] volume = [0.0, 1.0]: must be six numbers"),
     ('[tracks]\npath = "a.csv"\nbox = 1\nvolume = [0, 1, 0, 1, 0, 1]\n', "[tracks] box = 1.0: a volume is given too"),
     ('[tracks]\npath = "a.csv"\ncolumns = {x = 0}\n', "[tracks.columns] x = 0: must be a string in quotes, or a whole"),
-    ('[tracks]\npath = "a.csv"\ncolumns = {X = 1}\n', "[tracks.columns] X = 1: no such key; did you mean x?"),
+    ('[tracks]\npath = "a.csv"\ncolumns = {X = 1}\n', "[tracks.columns] X: no such key; valid here: track, time, x"),
     ('[tracks]\npath = "a.csv"\nformat = "cvs"\n', '[tracks] format = "cvs": must be one of "h5md"'),
     (FLOW + TIME + "realisations = [3]\n", "[time] realisations: no such key"),
     ("realisations = [3]\n" + FLOW + TIME, "realisations = [3]: the scene has no [simulation]"),

@@ -346,6 +346,20 @@ particles = true
 
 
 @pytest.mark.mpi(1)
+@pytest.mark.parametrize("method", ["least-squares", "kriging", "average"])
+def test_eight_tracks_in_a_box_have_fields(comm, tmp_path, no_figures, method):
+    """The ball that holds the neighbours of a kernel would be larger than the box."""
+    times, start = 0.01 * np.arange(4), np.random.default_rng(1).random((8, 3))
+    position = start + np.multiply.outer(times, np.sin(2 * np.pi * start[:, [1, 2, 0]]))
+    write_tracks(tmp_path / "few.h5", np.repeat(times, 8), np.tile(np.arange(8), 4), position.reshape(-1, 3) % 1,
+                 edge=1.0)
+    run(scene_of(comm, tmp_path, f'[tracks]\npath = "few.h5"\n[reconstruction]\nmethod = "{method}"\n'
+                                 'fields = ["velocity"]\n'), output=tmp_path / "run", comm=comm)
+    with h5py.File(tmp_path / "run/reconstruction.h5") as file:
+        assert 0 < np.abs(file["fields/reconstructed/velocity"][()]).max() < 3  # velocities are at most 1
+
+
+@pytest.mark.mpi(1)
 def test_a_volume_has_no_images(comm, tmp_path):
     """A particle that moves by more than half of the cube, to and fro: x = 0.1 + 0.7 (2 t - t^2) at t = 0, 1, 2."""
     write_tracks(tmp_path / "a.h5", [0, 1, 2], [0, 0, 0], [[0.1, 0.5, 0.5], [0.8, 0.5, 0.5], [0.1, 0.5, 0.5]])
