@@ -205,9 +205,11 @@ def test_example_scenes_have_all_stages(folder):
 @pytest.mark.parametrize("file", ["cube.h5", "cube.npz"])
 def test_a_cube_of_any_layout_is_converted(comm, tmp_path, convert, file):
     velocity = turbulence(comm)
-    for stored in (velocity, velocity.transpose(0, 3, 2, 1)):
-        for datasets in (dict(zip("uvw", stored)), {"velocity": stored}, {"velocity": np.moveaxis(stored, 0, -1)}):
-            assert np.array_equal(convert(tmp_path, file, datasets), velocity)
+    layouts = [datasets for stored in (velocity, velocity.transpose(0, 3, 2, 1)) for datasets in (
+        dict(zip("uvw", stored)), {"velocity": stored}, {"velocity": np.moveaxis(stored, 0, -1)})]
+    for number, datasets in enumerate(layouts):
+        (folder := tmp_path / str(number)).mkdir()
+        assert np.array_equal(convert(folder, file, datasets), velocity)
 
 
 def test_the_scene_with_an_own_pair_force_differs_from_the_published_system_in_this_force(folder):
