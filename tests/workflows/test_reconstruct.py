@@ -65,7 +65,9 @@ def exact_of(x, y, z, mean, unit, viscosity):
     slope[0, 0], slope[0, 1], slope[1, 0], slope[1, 1] = cx * cy, -sx * sy, sx * sy, -cx * cy
     drift = mean.reshape(3, *[1] * x.ndim)
     return {"velocity": unit * (np.stack([sx * cy, -cx * sy, zero]) + drift),
-            "gradient": slope.reshape(9, *x.shape), "vorticity": np.stack([zero, zero, 2 * sx * sy]),
+            "gradient": slope.reshape(9, *x.shape),
+            "strain": np.stack([cx * cy, -cx * cy, zero, zero, zero, zero]),
+            "dissipation": unit**2 * 4 * viscosity * (cx * cy)[None] ** 2, "vorticity": np.stack([zero, zero, 2 * sx * sy]),
             "q": (-(cx * cy) ** 2 + (sx * sy) ** 2)[None], "r": zero[None],
             "pressure": unit**2 * (np.cos(2 * x) + np.cos(2 * y))[None] / 4,
             "acceleration": unit * np.stack([sx * cx - 2 * viscosity * sx * cy, sy * cy + 2 * viscosity * cx * sy,
@@ -100,6 +102,32 @@ def test_validation_estimates_the_true_error(comm, flow, tmp_path, linked, metho
     # Tracks that are left out have fewer neighbours, so their error is somewhat larger.
     assert 0.7 < errors["validation_error"] / errors["velocity_error"] < 1.6
     assert shapes["velocity"][1:] == (3, 20, 20, 20) and shapes["q"][1:] == (1, 20, 20, 20)
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("method", ["least-squares", "memory"])
+def test_errors_are_within_their_standard_deviations(comm, flow, tmp_path, linked, method):
+    """Against the true filtered fields, on the grid. Means over frames and components."""
+    scene, folder = flow
+    linked(folder)
+    settings = Reconstruction(method=method, fields=("velocity", "gradient"), holdout=0.0, samples=8, particles=True)
+    reconstruct.run(replace(scene, reconstruction=settings), comm, tmp_path)
+    with h5py.File(tmp_path / "reconstruction.h5") as file, h5py.File(folder / "ground_truth.h5") as truth:
+        made, stored = file["fields/reconstructed"], truth["fields/filtered"]
+        frames = [int(np.argmin(np.abs(made["time"][()] - time))) for time in stored["time"]][1:]
+        exact = stored["velocity"][1:].astype(float)
+        waves = np.fft.fftfreq(20, 1 / 20) * (np.abs(np.fft.fftfreq(20, 1 / 20)) < 10)
+        slopes = [np.fft.ifft(1j * waves.reshape(-1, *[1] * (4 - axis)) * np.fft.fft(exact, axis=axis), axis=axis).real
+                  for axis in (4, 3, 2)]
+        gradient = np.stack(slopes, 2).reshape(len(exact), 9, *exact.shape[2:])
+        for name, true in (("velocity", exact), ("gradient", gradient)):
+            ratio = np.abs(made[name][frames] - true) / made[f"{name}_deviation"][frames]
+            # The aims for two standard deviations; 0.65 and 0.92 of 8 samples.
+            assert 0.60 < (ratio < 1).mean() < 0.76 and 0.88 < (ratio < 2).mean() < 0.98, name
+        at_tracks = file["particles/tracks/velocity_deviation/value"][()]
+        assert np.sqrt((at_tracks**2).mean()) == pytest.approx(
+            np.sqrt((made["velocity_deviation"][()] ** 2).mean()), rel=0.2)
+        assert made["gradient_deviation"].attrs["units"] == "1/T"
 
 
 @pytest.mark.mpi(1)
@@ -143,7 +171,7 @@ def test_fields_do_not_depend_on_the_number_of_ranks(comm, flow, tmp_path, linke
 def test_a_stopped_reconstruction_is_the_one_never_stopped(comm, flow, tmp_path, linked, method):
     (scene, folder), found = flow, []
     scene = replace(scene, reconstruction=Reconstruction(method=method, every=3, fields=("velocity", "r"),
-                                                         particles=True))
+                                                         particles=True, samples=2))
     for steps in (10**9, 3):
         directory = tmp_path / str(steps)
         if comm.rank == 0:
@@ -158,6 +186,7 @@ def test_a_stopped_reconstruction_is_the_one_never_stopped(comm, flow, tmp_path,
         with h5py.File(directory / "reconstruction.h5") as file:
             found.append({name: file[name][()] for name in (
                 "fields/reconstructed/velocity", "fields/reconstructed/r", "particles/tracks/track/value",
+                "fields/reconstructed/velocity_deviation", "particles/tracks/velocity_deviation/value",
                 "particles/tracks/velocity/value", "errors_over_time/validation_error", "errors_of_fields/time")})
     for name, values in found[0].items():
         np.testing.assert_array_equal(values, found[1][name], err_msg=name)

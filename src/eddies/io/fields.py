@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 
 from eddies.io.hdf5 import append_frame, find_group, growing_dataset, read_frame, read_times, unfit
-from eddies.io.units import UNITS, component_axis
+from eddies.io.units import component_axis, unit_of
 
 
 class FieldWriter:
@@ -27,7 +27,7 @@ class FieldWriter:
         self._time = growing_dataset(group, "time", (), np.float64, "time", "T")
         self._variables = {variable: growing_dataset(
             group, variable, (components, *[cells] * 3), np.float32,
-            f"time {component_axis(variable, components, 'component')} z y x", UNITS.get(variable, ""))
+            f"time {component_axis(variable, components, 'component')} z y x", unit_of(variable))
             for variable, components in variables.items()}
 
     def append(self, time: float, start_plane: int, variables: Mapping[str, np.ndarray]) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 import eddies
 from eddies.io.hdf5 import append_frame, find_group, growing_dataset, read_frame, read_times, unfit, write_array
-from eddies.io.units import UNITS, component_axis
+from eddies.io.units import UNITS, component_axis, unit_of
 
 IMAGE = "image"
 MOLECULAR = {"position": "Angstrom", "box/edges": "Angstrom", "velocity": "Angstrom ps-1"}
@@ -66,7 +66,7 @@ class TrajectoryWriter:
 
     def _column(self, column: str, total: int, shape: tuple[int, ...], dtype: str | np.dtype) -> h5py.Dataset:
         axes = ["time", "particle", *(component_axis(column, size, "xyz") for size in shape)]
-        return self._element(column, (total, *shape), dtype, " ".join(axes), UNITS.get(column, ""))
+        return self._element(column, (total, *shape), dtype, " ".join(axes), unit_of(column))
 
     def _element(self, column: str, frame_shape: tuple[int, ...], dtype: str | np.dtype, axes: str,
                  units: str) -> h5py.Dataset:

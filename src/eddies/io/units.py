@@ -6,7 +6,10 @@ is 1 M/L^3. A dataset of a pure number has no units.
 
 #: Units of quantities at particles and on grids, by name of the column or variable.
 UNITS = {"position": "L", "coordinates": "L", "velocity": "L/T", "acceleration": "L/T^2", "density": "M/L^3",
-         "gradient": "1/T", "vorticity": "1/T", "q": "1/T^2", "r": "1/T^3", "pressure": "L^2/T^2"}
+         "gradient": "1/T", "vorticity": "1/T", "strain": "1/T", "dissipation": "L^2/T^3", "q": "1/T^2", "r": "1/T^3",
+         "pressure": "L^2/T^2"}
+#: End of the name of a standard deviation, after the name of the quantity.
+DEVIATION = "_deviation"
 # Attributes of a file with a flow.
 CONVENTIONS = {
     "units": "L: edge of the cube over 2 pi; T: follows from lengths and velocities; M: so that the mean density is "
@@ -21,6 +24,11 @@ ORIGINS = {
     "measures": "the start of the rollout, start_time after the release of the tracers",
     "rollout": "the start of the rollout, start_time (attribute of rollout) after the release of the tracers",
 }
+
+
+def unit_of(name: str) -> str:
+    """Return the units of a quantity or of its standard deviation; empty for a pure number."""
+    return UNITS.get(name.removesuffix(DEVIATION), "")
 
 
 def conventions(kind: str) -> dict[str, str]:

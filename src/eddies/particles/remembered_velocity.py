@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,6 +15,8 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
 
 ANGLE = 0.5  # upper limit of u' k_c dt in a substep dt of the forecast
+# Time for which a flow follows its forecasts, over the `memory` of the estimate; measured in docs/closure.md.
+FAITH = 5.0
 
 
 @dataclass
@@ -50,6 +52,9 @@ class RememberedVelocity:
         self._latest: tuple[float, Tensor] | None = None
         self._penalty = self.solver.equations.penalty  # sigma^2 over the variance of the latest prior
         self._count = 0.0
+        #: the equations of the latest moment
+        self.equations = self.solver.equations
+        self._prior: _Prior | None = None
 
     @torch.no_grad()
     def of(self, particles: ParticleSet, time: float) -> Tensor:
@@ -68,15 +73,29 @@ class RememberedVelocity:
             turn = step * grid.wavenumber_squared.sqrt() * self._speed(latest / self.transfer)
             worth, points = torch.exp(-turn / (2 * self.memory)), grid.points(particles.position)
             self._penalty = self._next_penalty(worth)
-            equations = LeastSquares(grid, self.solver.equations.inside, self._penalty)
-            prior = grid.with_mean(worth * self.solver.advected(self.forecast(latest, step), step, mean), mean)
+            self.equations = LeastSquares(grid, self.solver.equations.inside, self._penalty)
+            self._prior = _Prior(latest, self.forecast(latest, step), step, mean, worth)
+            prior = grid.with_mean(worth * self.solver.advected(self._prior.forecast, step, mean), mean)
             missing = particles.velocity - grid.at(prior, points)
-            right = equations.descent(missing, points, torch.zeros_like(prior))
-            change = equations.solve(points, right, count, self.solver.tolerance**2 * square, None,
-                                     self.solver.most_iterations)
+            right = self.equations.descent(missing, points, torch.zeros_like(prior))
+            change = self.equations.solve(points, right, count, self.solver.tolerance**2 * square, None,
+                                          self.solver.most_iterations)
             modes = prior + change.modes
         self._latest, self._count = (time, modes), float(count)
         return modes
+
+    def deviation(self, error: Tensor, random: Tensor) -> Tensor:
+        """Return how far a possible flow is from the mean of the latest prior.
+
+        `error` e are the modes of the previous estimate u minus the flow, and `random` are modes drawn from the prior P
+        of the solver. The result is gamma F(u - e) - beta F(u) + (1 - gamma^2)^(1/2) `random` with the forecast F and
+        gamma = beta^(1/5): flows follow their forecasts for longer than the estimate counts these. The mean over the
+        box has no prior and is left out. Collective.
+        """
+        latest, forecast, step, mean, worth = self._prior
+        follows = worth ** (1 / FAITH)
+        changed = follows * self.forecast(latest - self.solver.grid.without_mean(error), step) - worth * forecast
+        return self.solver.advected(changed, step, mean) + (1 - follows**2).sqrt() * random
 
     def state_dict(self) -> dict[str, Any]:
         """State for the next moment; empty before the first. `modes` and `penalty` are tensors of the latest estimate.
@@ -121,3 +140,14 @@ class RememberedVelocity:
     def _speed(self, modes: Tensor) -> float:
         """Return the rms u' of a component of the velocity with these modes; collective."""
         return math.sqrt(float(self.solver.grid.mean_square(modes)) / 3)
+
+
+class _Prior(NamedTuple):
+    """What the prior of a moment is made of: the previous estimate without its mean, its forecast after a time `step`,
+    its `mean`, with which it moves, and `worth`, beta of each mode."""
+
+    latest: Tensor
+    forecast: Tensor
+    step: float
+    mean: Tensor
+    worth: Tensor

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +35,8 @@ TOLERANCE, TOLERANCE_PREDICTED = 2e-4, 1e-3
 # frames then have an error of 2e-3, and the solve takes half as many iterations as with a tolerance of 2e-4.
 TOLERANCE_ADJOINT = 3e-3
 MOST_ITERATIONS = 300
+# k eta beyond which the prior's spectrum has no dissipation: less than 1e-8 of it.
+SPECTRUM_END = 4.0
 # Number of wavenumber shells in each band of `band_energies`.
 BAND = 2
 
@@ -380,13 +382,29 @@ def _prior(grid: FourierGrid, filter_width: float, kolmogorov_length: float,
     <v.v> of all modes.
     """
     unit = 2 * math.pi / grid.decomposition.length
-
-    def law(shell):
-        k = unit * shell
-        return shell**-EXPONENT * dissipation_range(k * kolmogorov_length) * gaussian_transfer(k**2, filter_width) ** 2
-
-    modes = torch.where(inside, torch.from_numpy(law(grid.shell.clamp_min(1).numpy())), 0.0)
+    law = partial(_mode_energy, filter_width=filter_width, kolmogorov_length=kolmogorov_length)
+    modes = torch.where(inside, torch.from_numpy(law(unit * grid.shell.clamp_min(1).numpy())), 0.0)
     total = float(global_sum(grid.decomposition.comm, float(2 * (modes * grid.multiplicity).sum())))
     shells = np.arange(1, 40 * grid.resolved, dtype=float)
-    energy = shells**2 * law(shells)
+    energy = shells**2 * law(unit * shells)
     return modes / total, float(energy[shells > grid.resolved].sum() / energy.sum())
+
+
+def _mode_energy(k: np.ndarray, filter_width: float, kolmogorov_length: float) -> np.ndarray:
+    """Return k^(-11/3) f(k eta) G^2, the energy of a mode that the prior expects, up to a factor."""
+    return k**-EXPONENT * dissipation_range(k * kolmogorov_length) * gaussian_transfer(k**2, filter_width) ** 2
+
+
+def captured_dissipation(grid: FourierGrid, filter_width: float, kolmogorov_length: float) -> float:
+    """Return the share of the dissipation rate of the unfiltered flow that modes up to k_c of the filtered one contain.
+
+    It is that of the prior's spectrum: the sum of k^4 k^(-11/3) f(k eta) G^2 over |k| <= k_c, divided by the same sum
+    with G = 1 over all k. Raises ValueError if `kolmogorov_length` is not positive: without a dissipation range the
+    second sum is infinite.
+    """
+    if kolmogorov_length <= 0:
+        raise ValueError(f"kolmogorov_length = {kolmogorov_length}: must be positive")
+    unit = 2 * math.pi / grid.decomposition.length
+    k = unit * np.arange(1, max(grid.resolved, math.ceil(SPECTRUM_END / (unit * kolmogorov_length))) + 1)
+    filtered, whole = (k**4 * _mode_energy(k, width, kolmogorov_length) for width in (filter_width, 0.0))
+    return float(filtered[:grid.resolved].sum() / whole.sum())

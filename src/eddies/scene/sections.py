@@ -385,7 +385,10 @@ class Kernel(Section):
 
 
 #: Quantities of [reconstruction] fields, with the number of components of each.
-RECONSTRUCTED = {"velocity": 3, "gradient": 9, "vorticity": 3, "q": 1, "r": 1, "pressure": 1, "acceleration": 3}
+RECONSTRUCTED = {"velocity": 3, "gradient": 9, "vorticity": 3, "strain": 6, "dissipation": 1, "q": 1, "r": 1,
+                 "pressure": 1, "acceleration": 3}
+#: Those of them that are linear in the velocity. With [reconstruction] samples, their standard deviations are stored.
+LINEAR = "velocity", "gradient", "vorticity", "strain"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -398,12 +401,30 @@ class Reconstruction(Section):
     cells: int | None = integer("cells along each side of the grid; absent: those of the stored fields", default=None,
                                 at_least=8, at_most=MOST_CELLS)
     every: int = integer("interval between reconstructions, in frames", default=1, at_least=1)
-    fields: tuple[str, ...] = texts("quantities that are stored; gradient: du_i/dx_j, row by row; q, r: its invariants",
+    fields: tuple[str, ...] = texts("quantities that are stored; gradient: du_i/dx_j, row by row; strain: its "
+                                    "symmetric part, xx, yy, zz, xy, xz, yz; q, r: its invariants",
                                     *RECONSTRUCTED, default=("velocity", "vorticity", "pressure"))
     particles: bool = boolean("whether the quantities are stored at the particles too", default=False)
     holdout: float = number("share of the tracks that a second reconstruction leaves out, to estimate the error; 0: "
                             "none", default=0.1, at_least=0, at_most=0.5)
     memory: float = number("time for which a wave is remembered, in units of 1 / (k u')", default=4.0, above=0)
+    samples: int = integer("number of random errors of a frame, whose rms is stored as standard deviation of those of "
+                           "velocity, gradient, vorticity and strain that are among fields; 0: none", default=0,
+                           at_least=0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.samples and self.of_neighbors:
+            raise self.problem("samples", f'method = "{self.method}" has no errors that could be drawn; set method = '
+                               '"least-squares" or "memory", or samples = 0')
+        if self.samples and not self.deviations:
+            raise self.problem("samples", f"no quantity in fields has a standard deviation; add one of "
+                               f"{', '.join(LINEAR)} to fields, or set samples = 0")
+
+    @property
+    def deviations(self) -> tuple[str, ...]:
+        """The quantities whose standard deviations are stored."""
+        return tuple(name for name in self.fields if name in LINEAR) if self.samples else ()
 
     @property
     def of_neighbors(self) -> bool:

@@ -225,6 +225,8 @@ def storage(scene: Scene, stage: str, ranks: int, measured: Measured = {}) -> St
             resolved = settings.resolving(tracers, (scene.tracks or tracers).filtered)
         memory = TORCH_PROCESS + evaluation_memory(
             tracks.mean_count if tracks else tracers.particles, planes_for(resolved.particles), ranks)
+        if stage == "reconstruct" and settings.method == "memory":  # the modes of each sample
+            memory += settings.samples * 24 * planes_for(resolved.particles)**3 / ranks
         memory += ROW_BYTES * tracks.mean_count * len(tracks.times) if tracks else 0.0
         return Storage(memory, tracks_disk(scene, tracks) if stage == "dns" else fields_disk(scene, expected.frames))
     planes = planes_for(tracers.particles)
@@ -323,7 +325,8 @@ def tracks_disk(scene: Scene, tracks: TrackFrames | None) -> float | None:
 def fields_disk(scene: Scene, frames: int | None) -> float | None:
     """Return the disk space of reconstructed fields."""
     settings = scene.reconstruction
-    values = sum(RECONSTRUCTED[name] for name in settings.fields) * (settings.cells or scene.tracers.cells) ** 3
+    values = sum(RECONSTRUCTED[name] for name in (*settings.fields, *settings.deviations))
+    values *= (settings.cells or scene.tracers.cells) ** 3
     return frames and PRODUCT_BYTES + 4 * values * math.ceil(frames / settings.every)
 
 

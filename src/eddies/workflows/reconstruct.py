@@ -18,20 +18,23 @@ from eddies.io.flow_states import restored_modes, saved_modes
 from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments, TrajectoryLayout
 from eddies.io.hdf5 import File, Table, create_product, open_product, read_attributes, write_table
 from eddies.io.new_files import set_attributes
+from eddies.io.units import DEVIATION
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
+from eddies.particles.error_samples import ErrorSamples
 from eddies.particles.exchanges import fluctuations, relative_error
 from eddies.particles.particle_field import Form, ParticleField
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.particle_set import ParticleSet, as_numpy
-from eddies.particles.resolved_velocity import ResolvedVelocity
+from eddies.particles.remembered_velocity import RememberedVelocity
+from eddies.particles.resolved_velocity import ResolvedVelocity, captured_dissipation
 from eddies.particles.smoothing_kernels import CubicSpline, SmoothingKernel
 from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Reconstruction, Scene, Tracers, Tracks
 from eddies.scene.sections import NEIGHBORS, RECONSTRUCTED
-from eddies.spectral.spectral_grid import SpectralGrid, regrid
+from eddies.spectral.spectral_grid import SYMMETRIC, SpectralGrid, regrid
 from eddies.workflows.ground_truth.track_frames import TrackFrames, count_for
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import load_form
@@ -42,6 +45,8 @@ from eddies.workflows.track_solver import (HELD_OUT, NO_FILTER, Method, UniformM
 log = logging.getLogger("eddies")
 
 MOST_RADIUS = 0.499 * BOX_LENGTH    # of a kernel: a particle must have one image within it
+# Arrays of modes in the states of methods and samples, with their numbers of dimensions.
+MODES = {"modes": 4, "penalty": 3, "errors": 4}
 
 
 class NeighbourMethod(Method):
@@ -109,13 +114,15 @@ class ReconstructionRun:
     ----------
     source : the particles.
     methods : a method for all particles. With [reconstruction] holdout, also one for the particles that remain.
-    solver : solver on the grid of the modes. settings, tracers : sections [reconstruction] and [tracers].
+    samples : draws the errors of the first method. solver : solver on the grid of the modes.
+    settings, tracers : sections [reconstruction] and [tracers].
     viscosity, transfer : nu, and the transfer function G of the filter that the particles' velocity has passed.
     """
 
-    def __init__(self, source: Source, methods: Sequence[Method], solver: ResolvedVelocity, settings: Reconstruction,
+    def __init__(self, source: Source, methods: Sequence[Method], samples: ErrorSamples, settings: Reconstruction,
                  tracers: Tracers, viscosity: float, transfer: Tensor) -> None:
-        self.source, self.methods, self.solver, self.grid = source, methods, solver, solver.grid
+        self.source, self.methods, self.samples, self.solver = source, methods, samples, samples.solver
+        self.grid = self.solver.grid
         self.settings, self.tracers, self.viscosity, self.transfer = settings, tracers, viscosity, transfer
         self.frames = range(0, len(source.times), settings.every)
         cells = settings.cells or tracers.cells
@@ -132,6 +139,7 @@ class ReconstructionRun:
     def layout(self) -> FrameLayout:
         """The datasets of the frames. The column `track` of `tracks` is the id of a row's track, -1 in empty rows."""
         values = {name: RECONSTRUCTED[name] for name in self.settings.fields}
+        values |= {name + DEVIATION: RECONSTRUCTED[name] for name in self.settings.deviations}
         columns = {"track": (), "coordinates": (3,), **{name: (count,) for name, count in values.items()}}
         tracks = {"tracks": TrajectoryLayout(self.source.most, columns)} if self.settings.particles else {}
         return FrameLayout(BOX_LENGTH, tracks, np.float64,
@@ -153,11 +161,14 @@ class ReconstructionRun:
         modes = self.methods[0].of(particles, time)
         row = {"time": time, "seconds": perf_counter() - began}
         made = Quantities(modes, self.transfer, self.viscosity, self.grid, self.settings.fields, self.source.unit)
-        segments.fields["reconstructed"].append(time, self.target.decomposition.start, made.on(self.target))
+        on_grid, at_particles = made.on(self.target), made.at(particles) if self.settings.particles else {}
+        for spread, values in zip(self._deviations(particles, modes, frame), (on_grid, at_particles)):
+            values |= spread
+        segments.fields["reconstructed"].append(time, self.target.decomposition.start, on_grid)
         if self.settings.particles:
             place = as_numpy(particles.position) * self.source.unit - self.source.corner
             rows = sorted_rows(comm, self.source.most, {
-                "track": as_numpy(particles.id), "coordinates": place, **made.at(particles)})
+                "track": as_numpy(particles.id), "coordinates": place, **at_particles})
             segments.trajectories["tracks"].append(frame, time, 0 if comm.rank == 0 else self.source.most, rows)
         if len(self.methods) > 1:
             known, apart = split(particles, self.settings.holdout)
@@ -167,12 +178,24 @@ class ReconstructionRun:
                                                              frame)})
         self.errors.append(row)
 
+    def _deviations(self, particles: ParticleSet, modes: Tensor, frame: int) -> tuple[dict[str, np.ndarray], ...]:
+        """Return the standard deviations of the errors on the grid and, if they are stored, at the particles."""
+        wanted, squares = self.settings.deviations, (dict[str, np.ndarray](), dict[str, np.ndarray]())
+        for error in self.samples.of(particles, modes, frame):
+            made = Quantities(error, self.transfer, self.viscosity, self.grid, wanted, self.source.unit)
+            for total, values in zip(squares, (made.on(self.target),
+                                               made.at(particles) if self.settings.particles else {})):
+                for name, value in values.items():
+                    total[name] = total.get(name, 0.0) + value**2
+        return tuple({name + DEVIATION: np.sqrt(square / self.samples.count) for name, square in total.items()}
+                     for total in squares)
+
     def state_dict(self) -> dict[str, Any]:
         """Return the state for a checkpoint, without the frames, which have files of their own."""
         state: dict[str, Any] = {"reconstruct": {"errors": self.errors, "of_fields": self.of_fields, "plain": []}}
-        for number, method in enumerate(self.methods):
+        for number, part in enumerate([*self.methods, self.samples]):
             plain = {}
-            for name, value in method.state_dict().items():
+            for name, value in part.state_dict().items():
                 if isinstance(value, Tensor):
                     state[f"{name}-{number}"] = saved_modes(self.grid.spectral, as_numpy(value.resolve_conj()))
                 else:
@@ -184,10 +207,10 @@ class ReconstructionRun:
         """Continue from a checkpoint that was made on any number of ranks."""
         state = saved["reconstruct"]
         self.errors, self.of_fields = state["errors"], state["of_fields"]
-        for number, method in enumerate(self.methods):
+        for number, part in enumerate([*self.methods, self.samples]):
             modes = {name: torch.from_numpy(restored_modes(self.grid.spectral, saved, dimensions, f"{name}-{number}"))
-                     for name, dimensions in (("modes", 4), ("penalty", 3)) if f"{name}-{number}" in saved}
-            method.load_state_dict({**state["plain"][number], **modes})
+                     for name, dimensions in MODES.items() if f"{name}-{number}" in saved}
+            part.load_state_dict({**state["plain"][number], **modes})
 
 
 def sorted_rows(comm: Comm, most: int, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -231,8 +254,10 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         make = (partial(UniformMethod, solver) if source.uniform else
                 _maker(settings, tracers, scene.flow.viscosity, kernel, solver, weight, transfer))
         holdout = 0.0 if source.uniform else settings.holdout
-        whole = ReconstructionRun(source, [make() for _ in range(2 if holdout > 0 else 1)], solver, settings,
-                                  tracers, source.scales["viscosity"], transfer)
+        methods = [make() for _ in range(2 if holdout > 0 else 1)]
+        samples = ErrorSamples(solver, settings.samples,
+                               methods[0] if isinstance(methods[0], RememberedVelocity) else None)
+        whole = ReconstructionRun(source, methods, samples, settings, tracers, source.scales["viscosity"], transfer)
         saved = guard.checkpoints.newest()
         if saved is not None:
             whole.load_state_dict(saved)
@@ -251,11 +276,19 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 set_attributes(product.create_group("about"), {
                     "method": settings.method, "particles": (BOX_LENGTH / source.spacing) ** 3, "weight": weight,
                     "length_unit": source.unit, "corner": source.corner, "holdout": holdout,
-                    "highest_wavenumber": grid.resolved})
+                    "highest_wavenumber": grid.resolved, "samples": settings.samples, **_of_small_scales(source, grid)})
     guard.checkpoints.remove()
     log.info("reconstruct: %s; means over time: %s", settings.method, ", ".join(
         f"{key.replace('_', ' ')} {np.nanmean([row[key] for row in table]):.3g}"
         for table in tables.values() if table for key in table[0] if key != "time"))
+
+
+def _of_small_scales(source: Source, grid: FourierGrid) -> dict[str, float]:
+    """Return attributes for a flow whose Kolmogorov length eta is known: `spacing_over_eta`, and `dissipation_share`,
+    the share of the dissipation rate of the whole flow that the modes are expected to contain."""
+    eta = source.scales["kolmogorov_length"]
+    return {"spacing_over_eta": source.spacing / eta, "dissipation_share": captured_dissipation(
+        grid, source.scales["filter_width"], eta)} if eta > 0 else {}
 
 
 def _maker(settings: Reconstruction, tracers: Tracers, viscosity: float, kernel: SmoothingKernel,
@@ -279,9 +312,9 @@ class Quantities:
     @torch.no_grad()
     def __init__(self, modes: Tensor, transfer: Tensor, viscosity: float, grid: FourierGrid,
                  wanted: tuple[str, ...], unit: float) -> None:
-        self.grid, self.wanted, self.unit = grid, wanted, unit
+        self.grid, self.wanted, self.unit, self.viscosity = grid, wanted, unit, viscosity
         self._modes = {"velocity": modes}
-        if {"gradient", "vorticity", "q", "r"} & {*wanted}:
+        if {"gradient", "vorticity", "strain", "dissipation", "q", "r"} & {*wanted}:
             self._modes["gradient"] = torch.cat([grid.gradient(component) for component in modes])
         if {"pressure", "acceleration"} & {*wanted}:
             modes = grid.without_mean(modes)  # a mean velocity has no effect, but would add round-off errors
@@ -311,7 +344,9 @@ class Quantities:
         if "gradient" in given:
             a = given["gradient"].reshape(3, 3, *velocity.shape[1:])
             square = np.einsum("ij...,jk...->ik...", a, a)
-            found |= {"gradient": given["gradient"],
+            strain = np.stack([(a[i, j] + a[j, i]) / 2 for i, j in SYMMETRIC])
+            rate = 2 * self.viscosity * (strain[:3]**2 + 2 * strain[3:]**2).sum(0)[None]
+            found |= {"gradient": given["gradient"], "strain": strain, "dissipation": self.unit**2 * rate,
                       "vorticity": np.stack([a[2, 1] - a[1, 2], a[0, 2] - a[2, 0], a[1, 0] - a[0, 1]]),
                       "q": -np.einsum("ii...->...", square)[None] / 2,
                       "r": -np.einsum("ij...,ji...->...", square, a)[None] / 3}

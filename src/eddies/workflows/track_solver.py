@@ -12,6 +12,7 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.error_samples import mixed
 from eddies.particles.exchanges import fluctuations, mean_over_ranks, relative_error
 from eddies.particles.flow_units import CELLS_PER_WAVENUMBER, ReferenceScales, planes_for, resolved_wavenumber
 from eddies.particles.particle_set import ParticleSet, as_numpy
@@ -22,9 +23,6 @@ from eddies.scene.scene import BOX_LENGTH, Reconstruction, Tracers
 WEIGHTS = 10.0 ** np.arange(3, -1.1, -0.5)  # weights of the noise in least squares; cross-validation chooses one
 RISE = 1.02             # the search ends when the error exceeds the least error by this factor
 HELD_OUT = 0.1          # share of the particles that cross-validation leaves out
-# Shifts and factors that mix all 64 bits of an id (the finaliser of splitmix64; Steele, Lea and Flood 2014). Ids of
-# tracks may have any pattern, such as the number of a camera in their upper bits.
-MIXING = ((30, 0xbf58476d1ce4e5b9), (27, 0x94d049bb133111eb), (31, 1))
 NO_FILTER = 1e-3        # filter width divided by the spacing, for an unfiltered flow
 
 
@@ -54,10 +52,15 @@ class UniformMethod(Method):
 
 
 class LeastSquaresMethod(Method):
-    """Fits the modes to each frame alone by least squares. The solve starts from the modes of the previous frame."""
+    """Fits the modes to each frame alone by least squares. The solve starts from the modes of the previous frame.
+
+    It ends at the residual of a solve from zero. With that of a solve from a prediction, as in rollouts, the velocity
+    error of noiseless filtered tracks is 1.4 times as large.
+    """
 
     def __init__(self, solver: ResolvedVelocity) -> None:
         self._solver = solver
+        solver.tolerance_predicted = solver.tolerance
         self._near: Tensor | None = None
 
     @torch.no_grad()
@@ -111,10 +114,7 @@ def best_solver(particles: ParticleSet, make: Callable[[float], ResolvedVelocity
 
 def split(particles: ParticleSet, share: float) -> tuple[ParticleSet, ParticleSet]:
     """Split particles by id into the known ones and a `share` that is left out; the same on any number of ranks."""
-    mixed = as_numpy(particles.id).astype(np.uint64)
-    for shift, factor in MIXING:
-        mixed = (mixed ^ mixed >> np.uint64(shift)) * np.uint64(factor)
-    held_out = torch.from_numpy(mixed < np.uint64(share * 2.0**64))
+    held_out = torch.from_numpy(mixed(as_numpy(particles.id)) < np.uint64(share * 2.0**64))
     known, held = (ParticleSet(particles.id[rows], particles.position[rows], particles.velocity[rows])
                    for rows in (~held_out, held_out))
     return known, held

@@ -81,9 +81,9 @@ def _unfit(scene: Scene) -> Iterator[str]:
     settings, wanted, model, simulation = scene.tracks, scene.reconstruction, scene.model, scene.simulation
     learned = [f"[{section}]" for section in ("kernel", "model", "simulation") if getattr(scene, section) is not None]
     if wanted is not None:
-        if settings.viscosity is None and (wanted.method == "memory" or "acceleration" in wanted.fields):
-            yield ("[tracks] viscosity: this key is missing, and the method memory and the acceleration need it; give "
-                   "it, or change [reconstruction]")
+        if settings.viscosity is None and {"memory", "acceleration", "dissipation"} & {wanted.method, *wanted.fields}:
+            yield ("[tracks] viscosity: this key is missing, and the method memory, the acceleration and the "
+                   "dissipation need it; give it, or change [reconstruction]")
         if settings.volume is not None and wanted.of_neighbors:
             yield (f'[reconstruction] method = "{wanted.method}": its points need particles on all sides, which a '
                    'volume that is not periodic lacks; set method = "least-squares" or "memory"')
