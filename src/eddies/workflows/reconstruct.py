@@ -16,7 +16,7 @@ from eddies.clock import ProgressLine
 from eddies.io.checkpoint import Checkpoint, Guard
 from eddies.io.flow_states import restored_modes, saved_modes
 from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments, TrajectoryLayout
-from eddies.io.hdf5 import File, Table, create_product, open_product, read_attributes, write_table
+from eddies.io.hdf5 import Table, create_product, open_product, write_table
 from eddies.io.new_files import set_attributes
 from eddies.io.units import DEVIATION
 from eddies.parallel.communicator import Comm
@@ -30,21 +30,20 @@ from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.remembered_velocity import RememberedVelocity
 from eddies.particles.resolved_velocity import ResolvedVelocity, captured_dissipation
-from eddies.particles.smoothing_kernels import CubicSpline, SmoothingKernel
+from eddies.particles.smoothing_kernels import SmoothingKernel
 from eddies.pipeline import STAGES
-from eddies.scene.scene import BOX_LENGTH, Reconstruction, Scene, Tracers, Tracks
-from eddies.scene.sections import NEIGHBORS, RECONSTRUCTED
+from eddies.scene.scene import BOX_LENGTH, Reconstruction, Scene, Tracers
+from eddies.scene.sections import RECONSTRUCTED
 from eddies.spectral.spectral_grid import SYMMETRIC, SpectralGrid, regrid
-from eddies.workflows.ground_truth.track_frames import TrackFrames, count_for
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import load_form
+from eddies.workflows.left_out_tracks import errors_at_left_out, kernel_of
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
-from eddies.workflows.track_solver import (HELD_OUT, NO_FILTER, Method, UniformMethod, best_solver, particles_on,
-                                           slabs_for, solver_of, solving_method, split, validation_error)
+from eddies.workflows.track_solver import HELD_OUT, Method, UniformMethod, solving_method, split, validation_error
+from eddies.workflows.track_source import Source
 
 log = logging.getLogger("eddies")
 
-MOST_RADIUS = 0.499 * BOX_LENGTH    # of a kernel: a particle must have one image within it
 # Arrays of modes in the states of methods and samples, with their numbers of dimensions.
 MODES = {"modes": 4, "penalty": 3, "errors": 4}
 
@@ -61,50 +60,6 @@ class NeighbourMethod(Method):
         field = ParticleField(slab, self._form.support, particles.position, particles.velocity)
         velocity = self._form.on_grid(field).T.reshape(3, slab.count, slab.planes, slab.planes)
         return self._grid.to_modes(velocity.to(self._grid.dtype))
-
-
-class Source:
-    """Reads the particles of each frame, from measured tracks or from a ground truth. The constructor is collective.
-
-    Attributes
-    ----------
-    times : times of the frames.
-    spacing : mean distance of the particles.
-    scales : reference scales of the flow, by name. For unfiltered velocities `filter_width` is NO_FILTER times the
-        spacing. `spacing` is that of particles that would resolve the modes in one frame (`Reconstruction.resolving`).
-    slab : this rank's part of the box, with the planes of the grid of the modes.
-    most : largest number of particles in a frame.
-    truth : the ground truth with true fields; None for measured tracks.
-    uniform : whether all measured tracks of a frame have the same velocity.
-    unit : the scene's unit of length, in the unit of the tracks.
-    corner : position of the origin of the tracks' coordinates in the cube, in the unit of the tracks.
-    """
-
-    def __init__(self, tracks: Tracks | None, tracers: Tracers, settings: Reconstruction, file: File,
-                 comm: Comm) -> None:
-        self._tracks, self.truth, self.spacing, self.uniform = None, None, tracers.spacing, False
-        filtered, width = (tracks or tracers).filtered, tracers.filter_width
-        if tracks is not None:
-            self._tracks = source = TrackFrames(comm, tracks)
-            self.times, self.spacing, self.most = source.times, source.spacing, source.most
-            self.uniform = source.uniform
-            self.unit, self.corner = source.about["length_unit"], source.about["corner"]
-            tracers = tracers.with_count(count_for(self.spacing))
-        resolved = settings.resolving(tracers, filtered)
-        width = width if filtered else NO_FILTER * self.spacing
-        self.scales = read_attributes(file, "reference") | {"spacing": resolved.spacing, "filter_width": width}
-        self.slab = slabs_for(comm, tracers, resolved, width, self.scales["kolmogorov_length"])
-        if tracks is None:
-            self.truth = truth = GroundTruth(file, comm, planes=self.slab.planes)
-            self.times, self.most = truth.times, truth.total
-            self.unit, self.corner = 1.0, np.zeros(3)
-
-    def particles(self, frame: int) -> ParticleSet:
-        """Return this rank's particles of a frame, with position and velocity; collective."""
-        if self._tracks is not None:
-            return particles_on(self.slab, self._tracks.frame(frame))
-        columns = self.truth.particles(frame)
-        return ParticleSet.from_numpy({name: columns[name] for name in ("id", "position", "velocity")})
 
 
 class ReconstructionRun:
@@ -243,12 +198,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                   " of the reconstruction")
     with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as file:
         source = Source(scene.tracks, tracers, settings, file, comm)
-        solver, weight, _ = best_solver(source.particles(0), partial(solver_of, source.slab, source.scales),
-                                        settings.holdout or HELD_OUT, source.uniform)
-        filtered = (scene.tracks or tracers).filtered
+        solver, weight, transfer = source.fitted(settings.holdout or HELD_OUT)
         grid = solver.grid
-        transfer = grid.filter_transfer(tracers.filter_width) if filtered else torch.ones_like(grid.shell)
-        kernel: SmoothingKernel = CubicSpline(min(tracers.radius_of(NEIGHBORS), MOST_RADIUS))
+        kernel: SmoothingKernel = kernel_of(tracers)
         if settings.of_neighbors and scene.kernel is not None and source.truth is not None:
             kernel = load_form(comm, directory / STAGES["train-kernel"].file, source.truth.scales).kernel
         make = (partial(UniformMethod, solver) if source.uniform else
@@ -268,6 +220,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             with create_product(comm, directory / STAGES["reconstruct"].file, "reconstruction",
                                 stage_provenance(scene, "reconstruct")) as product:
                 segments.assemble(product)
+                if scene.tracks is not None and holdout > 0:
+                    set_attributes(product.create_group("left_out"), errors_at_left_out(scene, source, file, comm))
                 tables = {"errors_over_time": whole.errors, "errors_of_fields": whole.of_fields}
                 for name, table in tables.items():
                     if table:

@@ -255,7 +255,8 @@ def _shared(report: Report, alone: Comm) -> list[Section]:
             name: read_table(file, name) for name in ("kernels", "slices", "errors")})],
         "reconstruction": lambda file: [reconstruction.section(
             read_attributes(file, "about"), read_table(file, "errors_over_time"),
-            read_table(file, "errors_of_fields") if "errors_of_fields" in file else {}, _middle_plane(file))]}
+            read_table(file, "errors_of_fields") if "errors_of_fields" in file else {}, _middle_planes(file),
+            read_attributes(file, "left_out") if "left_out" in file else {})]}
     for kind in MAKER_OF:
         with report.opened(report.base, kind, alone) as file:
             if file is not None:
@@ -332,11 +333,13 @@ def _ground_truth_sections(file: File) -> list[Section]:
     return sections
 
 
-def _middle_plane(file: File) -> np.ndarray | None:
-    """Return u_x in the plane z = pi of the last reconstruction; None if the velocity is not stored."""
+def _middle_planes(file: File) -> dict[str, np.ndarray]:
+    """Return u_x and its standard deviation in the plane z = pi of the last reconstruction, by label, if stored."""
     series = FieldSeries(file, "reconstructed")
     middle = series.cells // 2
-    return series.read(-1, "velocity", middle, middle + 1)[0, 0] if "velocity" in series.variables else None
+    return {label: series.read(-1, name, middle, middle + 1)[0, 0]
+            for name, label in (("velocity", "u_x"), ("velocity_deviation", "standard deviation of u_x"))
+            if name in series.variables}
 
 
 def _simulation_cost(file: File) -> dict[str, Any]:

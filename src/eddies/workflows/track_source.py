@@ -1,0 +1,70 @@
+"""The particles of each frame, from measured tracks or a ground truth, and the solver that fits them."""
+
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from eddies.io.hdf5 import File, read_attributes
+from eddies.parallel.communicator import Comm
+from eddies.particles.particle_set import ParticleSet
+from eddies.particles.resolved_velocity import ResolvedVelocity
+from eddies.scene.scene import Reconstruction, Tracers, Tracks
+from eddies.workflows.ground_truth.track_frames import TrackFrames, count_for
+from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.track_solver import NO_FILTER, best_solver, particles_on, slabs_for, solver_of
+
+
+class Source:
+    """Reads the particles of each frame, from measured tracks or from a ground truth. The constructor is collective.
+
+    Attributes
+    ----------
+    times : times of the frames.
+    spacing : mean distance of the particles.
+    scales : reference scales of the flow, by name. For unfiltered velocities `filter_width` is NO_FILTER times the
+        spacing. `spacing` is that of particles that would resolve the modes in one frame (`Reconstruction.resolving`).
+    slab : this rank's part of the box, with the planes of the grid of the modes.
+    most : largest number of particles in a frame.
+    truth : the ground truth with true fields; None for measured tracks.
+    uniform : whether all measured tracks of a frame have the same velocity.
+    filtered : whether the tracks follow a filtered velocity.
+    unit : the scene's unit of length, in the unit of the tracks.
+    corner : position of the origin of the tracks' coordinates in the cube, in the unit of the tracks.
+    """
+
+    def __init__(self, tracks: Tracks | None, tracers: Tracers, settings: Reconstruction, file: File,
+                 comm: Comm) -> None:
+        self._tracks, self.truth, self.spacing, self.uniform = None, None, tracers.spacing, False
+        self.filtered, width = (tracks or tracers).filtered, tracers.filter_width
+        if tracks is not None:
+            self._tracks = source = TrackFrames(comm, tracks)
+            self.times, self.spacing, self.most = source.times, source.spacing, source.most
+            self.uniform = source.uniform
+            self.unit, self.corner = source.about["length_unit"], source.about["corner"]
+            tracers = tracers.with_count(count_for(self.spacing))
+        resolved = settings.resolving(tracers, self.filtered)
+        width = width if self.filtered else NO_FILTER * self.spacing
+        self.scales = read_attributes(file, "reference") | {"spacing": resolved.spacing, "filter_width": width}
+        self.slab = slabs_for(comm, tracers, resolved, width, self.scales["kolmogorov_length"])
+        if tracks is None:
+            self.truth = truth = GroundTruth(file, comm, planes=self.slab.planes)
+            self.times, self.most = truth.times, truth.total
+            self.unit, self.corner = 1.0, np.zeros(3)
+
+    def particles(self, frame: int) -> ParticleSet:
+        """Return this rank's particles of a frame, with position and velocity; collective."""
+        if self._tracks is not None:
+            return particles_on(self.slab, self._tracks.frame(frame))
+        columns = self.truth.particles(frame)
+        return ParticleSet.from_numpy({name: columns[name] for name in ("id", "position", "velocity")})
+
+    def fitted(self, share: float) -> tuple[ResolvedVelocity, float, Tensor]:
+        """Return the solver with the best weight of the noise for the first frame (`best_solver`), this weight, and the
+        transfer function of the filter that the particles' velocity has passed; collective."""
+        solver, weight, _ = best_solver(self.particles(0), partial(solver_of, self.slab, self.scales), share,
+                                        self.uniform)
+        grid = solver.grid
+        transfer = grid.filter_transfer(self.scales["filter_width"]) if self.filtered else torch.ones_like(grid.shell)
+        return solver, weight, transfer
