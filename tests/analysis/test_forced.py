@@ -24,7 +24,7 @@ class Stored:
 def rollout(factors=FACTORS):
     """A model whose velocities are those of the flow at the start times a factor for each frame."""
     random = np.random.default_rng(3)
-    columns = {name: random.standard_normal((500, 3)) for name in ("velocity", "acceleration")}
+    columns = {name: random.standard_normal((500, 3)) for name in ("position", "velocity", "acceleration")}
     gradient = random.standard_normal((500, 3, 3))
     attributes = {"eddy_turnover_time": 1.0, "injection_rate": 0.5, "start_time": 0.0}
     runs = {"model": Stored(columns, factors), "truth": Stored(columns, np.ones(1))}

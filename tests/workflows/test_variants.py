@@ -172,7 +172,7 @@ def test_a_variant_in_another_flow_makes_its_own_ground_truth(folder):
 
 
 @pytest.mark.mpi(2, timeout=300)
-@pytest.mark.usefixtures("no_figures", "quick_solves")
+@pytest.mark.usefixtures("no_figures")
 def test_variants_are_run_measured_and_kept(comm, folder, capfd, monkeypatch):
     """One that fails does not end the others, and is run again."""
     out, whole = folder / "out", simulate.run
