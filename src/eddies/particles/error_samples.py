@@ -16,7 +16,7 @@ from eddies.particles.remembered_velocity import RememberedVelocity
 from eddies.particles.resolved_velocity import ResolvedVelocity
 
 # Final residual of the solve for an error, relative to its right-hand side. Errors of large scales come from scales
-# that the particles alias, and appear last: with 3e-2 they are up to four times too small (docs/closure.md).
+# that the particles alias, and appear last: with 3e-2 they are up to four times too small.
 TOLERANCE = 4e-3
 # Number of draws that measure the levels of prior and noise. Each averages over all particles and modes.
 DRAWS = 4
