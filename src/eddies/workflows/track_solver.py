@@ -52,15 +52,10 @@ class UniformMethod(Method):
 
 
 class LeastSquaresMethod(Method):
-    """Fits the modes to each frame alone by least squares. The solve starts from the modes of the previous frame.
-
-    It ends at the residual of a solve from zero. With that of a solve from a prediction, as in rollouts, the velocity
-    error of noiseless filtered tracks is 1.4 times as large.
-    """
+    """Fits the modes to each frame alone by least squares. The solve starts from the modes of the previous frame."""
 
     def __init__(self, solver: ResolvedVelocity) -> None:
         self._solver = solver
-        solver.tolerance_predicted = solver.tolerance
         self._near: Tensor | None = None
 
     @torch.no_grad()
@@ -144,7 +139,11 @@ def slabs_for(comm: Comm, tracers: Tracers, resolved: Tracers, filter_width: flo
 
 
 def solver_of(slab: SlabDecomposition, reference: Mapping[str, float], weight: float) -> ResolvedVelocity:
-    """Make the least-squares solver with this weight of the noise.
+    """Make the least-squares solver with this weight of the noise. Each solve ends at the residual of one from zero.
+
+    With the residual of a solve from a prediction, as in rollouts, the velocity error of filtered tracks without noise
+    was 1.38 times as large for 16^3 tracks behind a filter of 26 Kolmogorov lengths, and 1.05 times for 32^3 behind one
+    of 13.
 
     `reference` holds the reference scales, with the names that they have in ground_truth.h5. The solver does not depend
     on those of velocity and acceleration, which may be 0.
@@ -153,7 +152,9 @@ def solver_of(slab: SlabDecomposition, reference: Mapping[str, float], weight: f
         velocity=1.0, acceleration=1.0,
         **{name: reference[name] for name in ("filter_width", "spacing", "density_mean", "viscosity",
                                               "kolmogorov_length")})
-    return ResolvedVelocity.on_slabs(slab, scales, weight=weight)
+    solver = ResolvedVelocity.on_slabs(slab, scales, weight=weight)
+    solver.tolerance_predicted = solver.tolerance
+    return solver
 
 
 def particles_on(slab: SlabDecomposition, columns: Mapping[str, np.ndarray]) -> ParticleSet:
