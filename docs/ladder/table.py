@@ -17,9 +17,10 @@ import numpy as np
 import torch
 from mpi4py import MPI
 
-from eddies.io.hdf5 import open_product, read_attributes
+from eddies.pipeline import STAGES
 from eddies.report.figures import GUIDE, LOOKS, panels, png, styled
 from eddies.scene.scene import Scene, load_scene
+from eddies.workflows.find_step import read_found_step
 from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.measure import is_current, read
 from eddies.workflows.rollout.method import TimeStep, make_method
@@ -50,8 +51,7 @@ def step_of(directory: Path, scene: Scene) -> TimeStep:
     """The integrator and the step of a rollout, the converged ones or those of the scene."""
     if not scene.simulation.finds_step:
         return TimeStep(scene.simulation.scheme.name, scene.simulation.longest_step)
-    with open_product(MPI.COMM_SELF, directory / "step.h5", "step") as file:
-        found = read_attributes(file, "found")
+    found, _ = read_found_step(directory / STAGES["find-step"].file, MPI.COMM_SELF)
     return TimeStep(found["integrator"], found["size"])
 
 

@@ -37,7 +37,7 @@ NAMES = {"track": ("track", "trackid", "particle", "partid"), "time": ("time",),
          **{axis: (axis, f"world{axis}") for axis in POINT},
          **{name: (name,) for name in VELOCITY}}
 WHOLE = ("track", "frame", *LINKS)   # columns of whole numbers
-OWN_IDS = {"trackid", "frameid", "worldx"}   # names in tables of OpenLPT, which number the tracks of each file anew
+OWN_IDS = {"trackid", "frameid", "worldx"}   # names that show a table of OpenLPT: each file numbers its own tracks
 HEAD, ROWS = 2**16, 50  # bytes, and rows after the heading, from which the layout is found
 LEAST_NUMBERS = 3       # least number of numbers in a row
 NO_ID = -1              # id of a row that belongs to no track

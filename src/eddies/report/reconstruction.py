@@ -15,8 +15,6 @@ ERRORS = {  # column of the table: label, colour, line style
     "validation_error": ("velocity at tracks left out", MODEL, "--"),
     "velocity_error": ("velocity field", BLUE, "-"),
     "gradient_error": ("velocity gradient", DNS, ":")}
-
-
 LEFT_OUT = {  # attribute of the group left_out: words
     "least-squares": "least squares", "memory": "memory", "kriging": "kriging", "delaunay": "Delaunay interpolation"}
 
