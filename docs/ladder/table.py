@@ -1,10 +1,11 @@
-"""Writes the table of the ladder from its run: each rung on the flow of the choice and on those of the test.
+"""Writes the table of a run of the ladder, of its choices or its widths: each variant on the flows of the test.
 
     .venv/bin/python docs/ladder/table.py runs/ladder [--seconds]
 
-The first realisation serves the choice, the others the test, whose mean and standard deviation stand in the table. With
+Realisation 2 serves the choice, the others the test, whose mean and standard deviation stand in the table. With
 `--seconds` the seconds of a turnover are measured, all rungs in turn on one core, else they are those of the last
-measurement. Writes ../results/ladder.json and the figure ../paper/ladder.png: error at T over the cost of a turnover.
+measurement. Writes ../results/RUN.json, and for the ladder the figure ../paper/ladder.png: error at T over the cost of
+a turnover.
 """
 
 import argparse
@@ -17,17 +18,17 @@ import numpy as np
 import torch
 from mpi4py import MPI
 
-from eddies.pipeline import STAGES
 from eddies.report.figures import GUIDE, LOOKS, panels, png, styled
 from eddies.scene.scene import Scene, load_scene
-from eddies.workflows.find_step import read_found_step
 from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.measure import is_current, read
 from eddies.workflows.rollout.method import TimeStep, make_method
+from eddies.workflows.run_directory.work import read_found_step, step_path
 from eddies.workflows.variants import rollouts
 
 HERE = Path(__file__).parent
-RESULTS, FIGURE = HERE.parent / "results" / "ladder.json", HERE.parent / "paper" / "ladder.png"
+RESULTS, FIGURE = HERE.parent / "results", HERE.parent / "paper" / "ladder.png"
+CHOICE = "realisation-2"
 #: The rungs that the line of the figure connects, and those whose names stand beside their points.
 LINE = "paper", "wide", "together", "local", "resolved"
 NAMED = *LINE, "horizons-8", "no-density"
@@ -49,9 +50,10 @@ def measures_of(directory: Path) -> dict[str, float | None]:
 
 def step_of(directory: Path, scene: Scene) -> TimeStep:
     """The integrator and the step of a rollout, the converged ones or those of the scene."""
-    if not scene.simulation.finds_step:
+    path = step_path(scene.simulation, directory)
+    if path is None:
         return TimeStep(scene.simulation.scheme.name, scene.simulation.longest_step)
-    found, _ = read_found_step(directory / STAGES["find-step"].file, MPI.COMM_SELF)
+    found, _ = read_found_step(path, MPI.COMM_SELF)
     return TimeStep(found["integrator"], found["size"])
 
 
@@ -87,7 +89,7 @@ def figure(found: dict[str, dict]):
     drawn, axes = panels(1, 1, (7.0, 4.4))
     axis, points = axes[0, 0], {}
     for name, row in found.items():
-        errors = [other["velocity_error_end"] for other in row["realisations"][1:]]
+        errors = [other["velocity_error_end"] for other in row["tests"]]
         if None not in errors and "seconds" in row:
             points[name] = row["seconds"], float(np.mean(errors)), float(np.std(errors, ddof=1))
     line = [name for name in LINE if name in points]
@@ -110,7 +112,8 @@ def figure(found: dict[str, dict]):
 
 
 def main(run: Path, timed: bool) -> None:
-    before = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    results = RESULTS / f"{run.name}.json"
+    before = json.loads(results.read_text()) if results.exists() else {}
     scene, found = load_scene(run / "scene.toml"), {}
     for name, runs in rollouts(scene, run).items():
         paths, own = [*runs], scene.variant[name]
@@ -125,14 +128,17 @@ def main(run: Path, timed: bool) -> None:
             row["seconds"] = seconds_of(runs[paths[1]], paths[1], step, paths[1] / "ground_truth.h5")
         elif "seconds" in before.get(name, {}):
             row["seconds"] = before[name]["seconds"]
-        found[name] = row | {"realisations": [measures_of(path) for path in paths]}
-    RESULTS.write_text(json.dumps(found, indent=1) + "\n")
-    FIGURE.write_bytes(png(figure(found)))
+        measures = {path.name: measures_of(path) for path in paths}
+        row |= {"choice": measures.pop(CHOICE)} if CHOICE in measures else {}
+        found[name] = row | {"tests": [*measures.values()]}
+    results.write_text(json.dumps(found, indent=1) + "\n")
+    if run.name == "ladder":
+        FIGURE.write_bytes(png(figure(found)))
     print(f"| rung | seconds a turnover | {' | '.join(SHOWN.values())} |")
     print("|---" * (2 + len(SHOWN)) + "|")
     for name, row in found.items():
         seconds = f"{row['seconds']:.2g}" if row.get("seconds", math.nan) > 0 else ""
-        cells = (cell(row["realisations"][1:], key) for key in SHOWN)
+        cells = (cell(row["tests"], key) for key in SHOWN)
         print(f"| `{name}` | {seconds} | {' | '.join(cells)} |")
 
 
