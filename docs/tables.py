@@ -43,7 +43,7 @@ WORDS = MEASURES | {"wall_seconds": "seconds a turnover", "core_seconds": "core 
                     "step_integrator": "integrator", "step_size": "step", "step_seconds": "search (s)",
                     "step_error_twice": "error with twice the step", "step_error": "error",
                     "step_error_half": "with half"}
-HEADS, FLOOR, SIMULATION = "heads", "floor", "simulation"
+HEADS, FLOOR, SIMULATION, UNMEASURED = "heads", "floor", "simulation", "unmeasured"
 # The steps that the search found: comparisons with their rows, and columns of the file.
 STEPS = HERE / "results" / "steps.csv"
 STEPS_OF = "hit-small", "compare-small", "compare-hit", "compare-coarse", "compare-256"
@@ -64,7 +64,7 @@ def table(comparison: str, columns: str, rows: str) -> str:
     # Any complete row has the floors, which are the truth's.
     results[FLOOR] = {key.removesuffix("_floor"): value for row in record["rows"] for key, value in row.items()
                       if key.endswith("_floor") and value is not None}
-    results[SIMULATION] = {"wall_seconds": record.get("simulation_seconds")}
+    results |= {SIMULATION: {"wall_seconds": record.get("simulation_seconds")}, UNMEASURED: {}}
     asked = [row.split(": ", 1) for row in rows.strip().splitlines()]
     heads = f" {asked.pop(0)[1]} " if asked[0][0] == HEADS else " "
     rule = "|---|" + "---|" * (heads.count("|") + len(keys))

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from eddies.io.hdf5 import open_product, read_attributes, read_table
-from eddies.scene.scene import SceneError
+from eddies.particles.flow_units import ReferenceScales
+from eddies.scene.scene import Model, SceneError, load_scene
 from eddies.workflows import find_step, simulate
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from tests.workflows.small_rollout import OWN_METHOD, prepared, with_method
@@ -130,6 +131,17 @@ def test_an_integrator_of_cheap_evaluations_is_tried_with_shorter_steps(comm):
     found, rung = find_step.cheapest([ladder(comm, "first", 1, 1.0, lambda h: 10 * h),
                                       ladder(comm, "cheap", 2, 0.4, lambda h: 9 * h)])
     assert found.integrator == "cheap" and found[rung].step.size == 0.01
+
+
+def test_steps_that_a_rollout_would_shorten_are_not_tried():
+    """Else a step and its half would be the same rollout, and pass for converged."""
+    scene = with_method(load_scene("hit-coarse").variant["paper"], "learned", frame_interval=1.0, step="converged")
+    scales = ReferenceScales(velocity=1.0, acceleration=1.0, filter_width=1.0, spacing=0.5, density_mean=1.0,
+                             viscosity=0.01)
+    local = replace(scene, model=Model(preset="local"))
+    first = {name: size for name, size, _ in find_step.integrators(local, scales, 2.0)}
+    assert first["rk3"] == first["rk2"] == 0.125 and first["verlet"] == 0.0625  # at most 0.157, 0.125, 0.0625 d/u'
+    assert {size for _, size, _ in find_step.integrators(scene, scales, 2.0)} == {1.0, 2.0}
 
 
 @pytest.mark.mpi(2)

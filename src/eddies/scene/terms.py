@@ -22,10 +22,10 @@ INPUTS = ("density", "distance", "speed", "approach")
 BASES = ("corrected", "paper", "unit")
 # The ratio of the largest rate at which the noise of a particle relaxes to the rate that the key `relaxation` gives. A
 # velocity relaxes to the estimate from its neighbours, and this estimate repeats the noise of the particle with the
-# opposite sign. The ratio is therefore 3.6 to 4.0, both among random particles and in turbulence. Two fifths of 4.0 are
-# added, because other effects let noise grow too: with a ratio of 4.2 a flow at M_t = 0.16 diverged after a turnover,
-# and with 5.5 a flow on 256^3 cells diverged after a few steps.
-NOISE_AMONG_NEIGHBORS = 5.6
+# opposite sign. The ratio is therefore 3.6 to 4.0, both among random particles and in turbulence. It is doubled, because
+# other effects let noise grow too. In flows that are forced for twenty turnovers the noise grows somewhere, by a fifth
+# to a third in a step, with rk2 and a ratio of 7. With 8 it does not; nor does it with corrected-verlet or rk3 and 7.
+NOISE_AMONG_NEIGHBORS = 8.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +72,7 @@ class TermSettings(Section):
     learns_through_horizons : whether only training through several steps of the simulation fits its parameters.
     viscous : whether it needs the viscosity of the fluid.
     damps_by : name of its parameter with damping rates by wavenumber, which a coarse grid can use; empty without one.
+    follows_flow : whether rollouts shorten their steps to `longest_step` in the present flow.
     too_long : text of the error for a step beyond `longest_step`; it may contain {name}, {longest} and {integrator}.
     """
 
@@ -81,6 +82,7 @@ class TermSettings(Section):
     learns_through_horizons: ClassVar[bool] = False
     viscous: ClassVar[bool] = False
     damps_by: ClassVar[str] = ""
+    follows_flow: ClassVar[bool] = False
     too_long: ClassVar[str] = ""
 
     def longest_step(self, units: StepUnits) -> float:
@@ -311,8 +313,10 @@ class FilteredEquations(TermSettings):
 
     reads = ("pairs", "density")
     gives = ("acceleration", "density_rate")
+    follows_flow = True
     too_long = ('with integrator = "{integrator}" and steps above about {longest} the noise of the particles, which '
-                'the term "{name}" damps, grows instead; lower step to {longest}')
+                'the term "{name}" damps, would grow, so the particles will take steps of about {longest}; lower step '
+                'to {longest}')
 
     def longest_step(self, units: StepUnits) -> float:
         """Return the longest step with which the scheme relaxes the noise of single particles without instability;
@@ -356,6 +360,7 @@ PRESETS: dict[str, dict[str, Mapping[str, Any]]] = {
     # adds nothing. It also doubles the cost, because the forces of a pair are then not opposite.
     "resolved + pairs": {**dict.fromkeys(RESOLVED, {}), "pairs": {"inputs": ("distance", "speed", "approach")}},
     "local": {"filtered-equations": {}, "eddy-viscosity": {}},
+    "local + pairs": {"filtered-equations": {}, "eddy-viscosity": {}, "pairs": {"hidden": (20, 20, 20, 20)}},
     "wcsph": {"continuity": {}, "wcsph": LITTLE_FRICTION},
     "transport-velocity": {"continuity": {}, "wcsph": LITTLE_FRICTION, "transport-velocity": {}},
 }

@@ -38,12 +38,14 @@ from eddies.parallel.migration import IdOrder
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.particles.exchanges import fluctuations, relative_error
+from eddies.particles.flow_units import ReferenceScales
 from eddies.pipeline import STAGES
 from eddies.scene.integrators import SCHEMES
-from eddies.scene.scene import Scene, SceneError, Simulation
+from eddies.scene.scene import Scene, SceneError
 from eddies.time_stepping import ETDRK4
 from eddies.workflows.ground_truth.truth import GroundTruth, open_truth
-from eddies.workflows.rollout.method import Method, TimeStep, make_method
+from eddies.workflows.learned.source import ModelDefinition
+from eddies.workflows.rollout.method import Method, TimeStep, allowed_by_terms, make_method
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 
 log = logging.getLogger("eddies")
@@ -228,7 +230,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                              f" on ground truth {number} of {len(truths)}" if len(truths) > 1 else "")
                      for number, truth in enumerate(truths, 1)]
         span = float(stretches[0].stops[-1])
-        ladders = [Ladder(tried, stretches, *integrator) for integrator in integrators(settings, span)]
+        ladders = [Ladder(tried, stretches, *integrator)
+                   for integrator in integrators(scene, truths[0].scales, span)]
         best = cheapest(ladders)
         if best is None:
             smallest = min(trial.step.size for ladder in ladders for trial in ladder.trials.values())
@@ -254,16 +257,26 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
              half.error)
 
 
-def integrators(settings: Simulation, span: float) -> Iterator[tuple[str, float, int]]:
-    """Yield the name, the longest step and the evaluations in a step of each integrator to try. `span` is the duration
-    of the short rollouts."""
+def integrators(scene: Scene, scales: ReferenceScales, span: float) -> Iterator[tuple[str, float, int]]:
+    """Yield the name, the longest step and the evaluations in a step of each integrator to try.
+
+    `scales` are those of the ground truth, and `span` is the duration of the short rollouts. Steps that a rollout would
+    shorten for a term are left out.
+    """
+    settings = scene.simulation
     if settings.form.on_grid:
         yield "etdrk4", ETDRK4.most_courant, ETDRK4.evaluations
         return
+    model = scene.model.settings if "model" in settings.form.needs else {}
+    terms = [term for term in model.values() if term.follows_flow]
     # A method of the user ignores the integrator, so one is enough.
     for name in settings.schemes[:1] if is_path(settings.method) else settings.schemes:
         scheme = SCHEMES[name]
-        yield name, span if scheme.dense else settings.frame_interval, scheme.evaluations
+        longest = span if scheme.dense else settings.frame_interval
+        if terms:
+            allowed = allowed_by_terms(terms, ModelDefinition.of(scene).units(scales), scheme, scales.velocity)
+            longest /= 2 ** max(math.ceil(math.log2(longest / allowed) - 1e-9), 0)
+        yield name, longest, scheme.evaluations
 
 
 def short_rollout(method: Method, step: TimeStep, stretch: Stretch, stop: StopRequest) -> Trial:

@@ -13,6 +13,7 @@ import torch
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.stop import Stopped
+from eddies.particles.exchanges import fluctuations, root_mean_square
 from eddies.particles.flow_units import resolved_wavenumber
 from eddies.particles.integrators import INTEGRATORS, RungeKutta
 from eddies.particles.resolved_velocity import ResolvedVelocity
@@ -22,6 +23,8 @@ from eddies.scene.sections import METHODS
 from eddies.workflows import report, simulate, train
 from eddies.workflows.diff import numbers_of
 from eddies.workflows.ground_truth.truth import open_truth
+from eddies.workflows.learned.model import initial_model
+from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.rollout.method import SOLVES, ParticleRun, make_method
 from tests.commands import first_rank
 from tests.workflows.small_rollout import OWN_METHOD, prepared, scales_of, scene_text, with_method
@@ -147,6 +150,23 @@ def test_steps_are_as_short_as_the_resolved_velocity_needs(comm, small_products,
     highest = int(resolved_wavenumber(scales.spacing, scales.filter_width, scales.kolmogorov_length))
     assert attributes["status"] == "complete" and attributes["steps"] > 2
     assert attributes["time_step"] * highest * columns["velocity"][0].std() == pytest.approx(0.05, rel=0.2)
+
+
+@pytest.mark.mpi(1, 2)
+def test_steps_follow_the_present_flow_if_a_term_asks_for_it(comm, small_products):
+    """In a flow with a quarter of the velocity the noise of single particles bears four times the step. The mean
+    velocity has no effect."""
+    scene, directory = small_products
+    local = ModelDefinition.of(replace(scene, model=Model(preset="local")))
+    with open_truth(comm, directory / "ground_truth.h5") as truth, torch.no_grad():
+        for factor in (1.0, 0.25):
+            run = ParticleRun(initial_model(local, truth.scales, comm), None,
+                              replace(scene.simulation, step=10.0, integrator="rk3"), truth, 1, limited=False)
+            velocity = factor * run.particles.velocity
+            run.particles = replace(run.particles, velocity=velocity + velocity.new_tensor([0.0, 0.0, 1.0]))
+            speed = root_mean_square(comm, fluctuations(comm, velocity))
+            run.advance(50.0, 1)  # perhaps with a fault: the density is not that of such a flow
+            assert run.time == pytest.approx(0.157 * truth.scales.filter_width / speed, rel=0.05)
 
 
 def reported(comm, directory, *remove):

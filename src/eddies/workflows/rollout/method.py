@@ -2,6 +2,8 @@
 choice of the method of a scene."""
 
 import logging
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,18 +17,19 @@ from eddies.io.weights import load_weights
 from eddies.parallel.broadcast import first_complaint
 from eddies.parallel.halo import HaloError
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.exchanges import mean_over_ranks
+from eddies.particles.exchanges import fluctuations, mean_over_ranks, root_mean_square
 from eddies.particles.faults import Limits, find_fault
 from eddies.particles.feature_range import FeatureRange, pair_features
-from eddies.particles.flow_units import allowed_step
+from eddies.particles.flow_units import FlowUnits, allowed_step
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.model import LagrangianModel
 from eddies.particles.moment import Moment, between
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.pipeline import STAGES
+from eddies.scene.integrators import Scheme
 from eddies.scene.scene import Eulerian, Scene, SceneError, Simulation
 from eddies.scene.scene import Forcing as ForcingSection
-from eddies.scene.terms import Forcing
+from eddies.scene.terms import Forcing, StepUnits, TermSettings
 from eddies.workflows.ground_truth.flow_run import restored_modes, restored_rows, saved_modes, saved_rows
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import particles_for, trained_model
@@ -119,6 +122,7 @@ class ParticleRun:
             deviation = max(RUNAWAY_DENSITY * scales.density, scales.density_mean)
         frame = mean_over_ranks(self.comm, self.particles.velocity)
         self.limits = Limits(RUNAWAY_SPEED * scales.velocity, frame, scales.density_mean, deviation)
+        self._limiting = [term.settings for term in self.model.terms.values() if term.settings.follows_flow]
         self._shares_outside: list[float] = []
         self._solves: dict[str, list[float]] = {name: [] for name in SOLVES}
 
@@ -154,13 +158,17 @@ class ParticleRun:
         return complaint
 
     def _allowed_step(self) -> float:
-        """Return the longest step that the resolved velocity allows in the present flow, or infinity if it sets no
-        limit."""
-        resolution = self.dynamics.resolution
+        """Return the longest step that the terms and the resolved velocity allow in the present flow, or infinity if
+        they set no limit."""
+        resolution, scheme = self.dynamics.resolution, self.integrator.scheme
+        allowed = math.inf
+        if self._limiting:
+            speed = root_mean_square(self.comm, fluctuations(self.comm, self.particles.velocity))
+            allowed = allowed_by_terms(self._limiting, self.model.flow, scheme, speed)
         if resolution is None or not self.limited:
-            return np.inf
+            return allowed
         highest = resolution.grid.resolved * 2 * np.pi / self.dynamics.box.length
-        return allowed_step(self.integrator.scheme.angle, highest, resolution.speed)
+        return min(allowed, allowed_step(scheme.angle, highest, resolution.speed))
 
     def _complaint_of_rates(self, number: int) -> str | None:
         """Return a complaint if a rate at the end of step `number` is not finite. The next frame and the next step use
@@ -280,6 +288,14 @@ class ParticleRun:
         evaluations of the rates."""
         return {"integrator": self.settings.scheme.name, "terms": ", ".join(self.model.terms) or "none",
                 "integrates_density": self.model.integrates_density, "evaluations": self.dynamics.evaluations}
+
+
+def allowed_by_terms(terms: Iterable[TermSettings], flow: FlowUnits, scheme: Scheme, speed: float) -> float:
+    """Return the longest step that terms allow in a flow with this rms of a velocity component; infinite without a
+    limit."""
+    units = StepUnits(radius=flow.cutoff, filter_width=flow.scales.filter_width, sound_speed=flow.scales.sound_speed,
+                      velocity=speed, scheme=scheme)
+    return min((term.longest_step(units) for term in terms), default=math.inf)
 
 
 def make_method(scene: Scene, step: TimeStep | None, truth: GroundTruth, start: int, directory: Path) -> Method:
