@@ -22,9 +22,9 @@ INPUTS = ("density", "distance", "speed", "approach")
 BASES = ("corrected", "paper", "unit")
 # The ratio of the largest rate at which the noise of a particle relaxes to the rate that the key `relaxation` gives. A
 # velocity relaxes to the estimate from its neighbours, and this estimate repeats the noise of the particle with the
-# opposite sign. The ratio is therefore 3.6 to 4.0, both among random particles and in turbulence. It is doubled, because
-# other effects let noise grow too. In flows that are forced for twenty turnovers the noise grows somewhere, by a fifth
-# to a third in a step, with rk2 and a ratio of 7. With 8 it does not; nor does it with corrected-verlet or rk3 and 7.
+# opposite sign. The ratio is therefore 3.6 to 4.0, both among random particles and in turbulence. It is doubled: other
+# effects let noise grow too. In flows that are forced for twenty turnovers the noise grows somewhere, by a fifth to a
+# third in a step, with rk2 and a ratio of 7. With 8 it does not; nor does it with corrected-verlet or rk3 and 7.
 NOISE_AMONG_NEIGHBORS = 8.0
 
 
