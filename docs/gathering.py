@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
-from paper import save
+from pictures import save
 
 from eddies.analysis.disorder import count_variance
 from eddies.io.hdf5 import open_product

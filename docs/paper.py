@@ -8,23 +8,24 @@ not given are left as they are; Fig. 3 takes their numbers from results/paper-a-
 results/paper-NAME.json, which are written here.
 """
 
-import io
 import json
 import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from mpi4py import MPI
-from PIL import Image
+from pictures import save
 
 from eddies import open_run
 from eddies.analysis.pdfs import bin_edges, bin_probabilities, gaussian, kl_divergence, pdf, standardized
 from eddies.flow.statistics import energy_spectrum
 from eddies.parallel.slab import SlabDecomposition
-from eddies.report.figures import (DNS, FILTERED, GUIDE, LOOKS, OTHERS, TRUTH, Variant, guide_power_law,
-                                   legend_at_foot, letter, mark_cutoff, number_wavenumbers, panels, png, styled)
-from eddies.report.rollout_figures import (invariant_planes, particle_pdfs, turnover_of, velocity_planes,
+from eddies.report.figures import (DNS, FILTERED, GUIDE, LOOKS, OTHERS, TRUTH, Variant, legend_at_foot, letter,
+                                   note, panels, plain_log_ticks, styled)
+from eddies.report.rollout_figures import (OUTER_BINS, invariant_planes, particle_pdfs, turnover_of, velocity_planes,
                                            vorticity_and_energy)
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.stored_run import StoredRun
@@ -35,9 +36,14 @@ HERE = Path(__file__).parent / "paper"
 MODELS = {"paper-forced": ("paper, forced", OTHERS[0]), "paper": ("paper", LOOKS["paper"]),
           "resolved": ("resolved", LOOKS["resolved"]), "local": ("local", LOOKS["local"])}
 BEFORE = bin_edges(8, 65)  # bins of Fig. 3, in standard deviations
+SHADE = "#e4e4e4"
+# Lines of the PDFs of accelerations in Fig. 3: of the truth, of the published model, and for comparison.
+PDFS = ({"color": TRUTH, "label": "true accelerations"},
+        {"color": LOOKS["paper"][0], "linestyle": "none", "marker": "o", "markersize": 3, "markerfacecolor": "none",
+         "label": "accelerations of paper"},
+        {"color": GUIDE, "linestyle": ":", "label": "Gaussian"})
 NAMES = "training", "mt008", "mt016", "mt004"
 NUMBERS = Path(__file__).parent / "results/paper-a-priori.json"
-COLOURS, WIDTH = 80, 1200  # of a picture in the documentation
 
 
 def mach_number(run: StoredRun) -> float:
@@ -66,30 +72,30 @@ def figure_3(numbers: dict[str, dict]):
     delay, machs, *shown = axes.flat
     training = numbers["training"]
     for name in training["models"]:
-        label, (colour, _) = MODELS[name]
-        line = {"color": colour}
-        delay.plot(training["delay"], training["models"][name], label=label, **line)
+        label, (colour, marker) = MODELS[name]
+        line = {"color": colour, "marker": marker, "markersize": 4, "label": label}
+        delay.plot(training["delay"], training["models"][name], **line)
         found = sorted((each["mach"], np.mean(each["models"][name])) for key, each in numbers.items()
                        if key != "training")
-        machs.plot(*np.transpose(found), marker="o", **line)
+        machs.plot(*np.transpose(found), **line)
     delay.plot(training["delay"], training["pressure_gradient"], color=GUIDE, label="exact filtered pressure gradient")
-    delay.axvspan(min(training["delay"]), 0, color="#eeeeee")
+    delay.axvspan(min(training["delay"]), 0, color=SHADE)
     delay.set(xlabel="time after the training interval", ylabel="acceleration error", ylim=(0, None),
               title="flow of the training")
     machs.set(xlabel="$M_t$", ylim=(0, None), title="unseen flows, mean over time")
     centres = (BEFORE[1:] + BEFORE[:-1]) / 2
     for axis, (key, each) in zip(shown, numbers.items()):
-        lines = {"color": TRUTH}, {"color": LOOKS["paper"][0], "linestyle": "none", "marker": "o", "markersize": 3,
-                                   "markerfacecolor": "none"}
-        for density, line in zip(np.array(each["pdfs"]), lines):
+        for density, line in zip(np.array(each["pdfs"]), PDFS):
             axis.semilogy(centres, np.where(density > 0, density, np.nan), **line)
-        axis.semilogy(centres, gaussian(centres), color=GUIDE, linestyle=":")
+        axis.semilogy(centres, gaussian(centres), **PDFS[-1])
         seen = "training flow, later" if key == "training" else "unseen"
         axis.set(title=f"$M_t = {each['mach']:.2f}$, {seen}", xlabel="$a$ / standard deviation", ylim=(1e-5, 2),
                  ylabel="PDF")
     for axis in shown[len(numbers):]:
         axis.remove()
-    legend_at_foot(figure, delay)
+    note(shown[0], OUTER_BINS, (0, 1), "axes fraction", (3, -10), fontsize=8)
+    legend_at_foot(figure, [*delay.get_legend_handles_labels()[0], Patch(color=SHADE, label="interval of the training"),
+                            *(Line2D([], [], **line) for line in PDFS)])
     letter([*axes.flat][:2 + len(numbers)])
     return figure
 
@@ -103,50 +109,39 @@ def drawn(run: Path, names: list[str]) -> list[Variant]:
 
 @styled
 def figure_8(rows: list[tuple[str, list[Variant], list[StoredRun]]]):
-    """Draw energy spectra at the start, the middle and the end; a row for each flow.
+    """Draw energy spectra up to k_d over those of the true tracers, at the start, the middle and the end; a row for
+    each flow.
 
     Spectra of particles are those of the field that the learned kernel reconstructs, as in the paper.
     """
     figure, axes = panels(len(rows), 3, (3.5, 3.1), sharex=True, sharey=True)
     for row, (title, rollouts, stored) in zip(axes, rows):
         flow, cutoff = rollouts[0].tables["flow_spectra"], rollouts[0].numbers["rollout"]["filter_wavenumber"]
-        known = flow["wavenumber"] >= 1
+        shown = np.arange(1, int(cutoff) + 1)
         for number, (axis, time) in enumerate(zip(row, flow["time"])):
+            truth = spectrum(stored[0].field(time=time, of="truth"))[shown]
+            axis.axhline(1, color=TRUTH, linewidth=1.2, label="true tracers")
             for column, line in (("energy_flow", {"color": DNS, "linestyle": ":", "label": "DNS"}),
                                  ("energy_filtered", {"color": FILTERED, "label": "filtered DNS"})):
-                axis.loglog(flow["wavenumber"][known], flow[column][number][known], linewidth=1.2, **line)
-            draw_spectrum(axis, stored[0].field(time=time, of="truth"), cutoff, label="true tracers",
-                          color=TRUTH)
+                axis.plot(shown, flow[column][number][shown] / truth, linewidth=1.2, **line)
             for each, run in zip(rollouts, stored):
-                draw_spectrum(axis, run.field(time=time, of="model"), cutoff, **each.line(each.tables["spectra"]))
-            mark_cutoff(axis, cutoff)
+                axis.plot(shown, spectrum(run.field(time=time, of="model"))[shown] / truth,
+                          **{**each.line(each.tables["spectra"]), "markevery": 1})
             axis.set_title(f"{title}, $t = {time / turnover_of(rollouts):.2f}\\,T$")
-            number_wavenumbers(axis)
-        row[0].set_ylabel("$E(k)$")
+        row[0].set(ylabel="$E(k)$ / true tracers", yscale="log")
+        plain_log_ticks(row[0].yaxis)
     for axis in axes[-1]:
-        axis.set_xlabel("wavenumber $k$")
-    peak = max(flow["energy_flow"].max(axis=0))
-    guide_power_law(axes[0, 0], (2, 10), 2.2 * peak, -5 / 3, r"$k^{-5/3}$")
-    axes[0, 0].set(ylim=(1e-5 * peak, 6 * peak), xlim=(0.9, 85))
+        axis.set(xlabel="wavenumber $k$", xticks=shown)
     legend_at_foot(figure, axes[0, 0])
     letter(axes.flat)
     return figure
 
 
-def draw_spectrum(axis, field, cutoff: float, **line) -> None:
-    """Draw the spectrum of a field (3, n, n, n) up to k_d, summed over shells of unit width."""
+def spectrum(field) -> np.ndarray:
+    """The spectrum of a field (3, n, n, n), summed over shells of unit width."""
     cells = field.shape[-1]
     grid = SpectralGrid(SlabDecomposition(MPI.COMM_SELF, 2 * np.pi, cells), cutoff=(cells - 1) // 2)
-    energy = energy_spectrum(grid, grid.forward(np.asarray(field, dtype=float)))
-    shown = np.arange(1, int(cutoff) + 1)
-    axis.loglog(shown, energy[shown], **line)
-
-
-def save(path: Path, figure) -> None:
-    """Write a picture with few colours."""
-    image = Image.open(io.BytesIO(png(figure))).convert("RGB")
-    image.thumbnail((WIDTH, 2 * WIDTH))
-    image.quantize(COLOURS).save(path, optimize=True)
+    return energy_spectrum(grid, grid.forward(np.asarray(field, dtype=float)))
 
 
 def main(arguments: list[str]) -> None:

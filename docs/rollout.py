@@ -6,7 +6,8 @@
 import sys
 from pathlib import Path
 
-from paper import drawn, save
+from paper import drawn
+from pictures import save
 
 from eddies.report.rollout_figures import velocity_planes
 

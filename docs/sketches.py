@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyBboxPatch
+from pictures import save
 
 from eddies.report.figures import BLUE, GUIDE, MODEL, NOTE, SECOND, styled
-from paper import save
 
 HERE = Path(__file__).parent
 # Stages: place of the middle in inches, what is done, the command, the product.

@@ -38,8 +38,7 @@ TABLE = re.compile(r"(<!-- table of ([\w-]+): ([^\n]*)\n(.*?)-->\n).*?(?=<!-- en
 NUMBERS = re.compile(r"(<!-- numbers of ([\w-]+)\n(.*?)-->\n).*?(?=<!-- end of numbers -->)", re.DOTALL)
 WORDS = MEASURES | {"wall_seconds": "seconds a turnover", "core_seconds": "core seconds a turnover",
                     "training_seconds": "training (s)",
-                    "break_even_simulation": "cheaper than the direct simulation after (T)",
-                    "break_even_grid": "cheaper than the best grid after (T)", "time_step": "step",
+                    "time_step": "step",
                     "step_integrator": "integrator", "step_size": "step", "step_seconds": "search (s)",
                     "step_error_twice": "error with twice the step", "step_error": "error",
                     "step_error_half": "with half"}
@@ -102,7 +101,8 @@ def numbers(run: str, rows: str) -> str:
 
 def number(row: Mapping[str, Any], key: str) -> str:
     """Two digits, or as many as the standard deviation determines; ratios to three digits after the point; steps to
-    three digits and their errors to four; a word as it is; empty without a number."""
+    three digits and their errors to four; a word as it is; empty without a number. Times of a busy machine are
+    marked."""
     value, spread = row.get(key), row.get(f"{key}_spread")
     if value is None or isinstance(value, str):
         return value or ""
@@ -113,7 +113,7 @@ def number(row: Mapping[str, Any], key: str) -> str:
     if key.endswith("_ratio"):
         return f"{value:.3f}" + (f" ± {spread:.3f}" if spread is not None else "")
     if spread is None or spread == 0:
-        return f"{float(f'{value:.2g}'):g}"
+        return f"{float(f'{value:.2g}'):g}" + (" (busy)" if key == "wall_seconds" and row.get("busy") else "")
     # To the first digit of the deviation, or to its second behind a 1.
     places = -math.floor(math.log10(spread / 1.95))
     if places > 5:

@@ -239,9 +239,9 @@ def test_table_of_scenes():
 
 def allowed(rule):
     """The values that a key may have, in few words."""
-    words = [f"`{quoted(word)}`" for word in rule.words]
+    words = [quoted(word) for word in rule.words]
     if rule.kind is bool:
-        return "`true`, `false`"
+        return "true, false"
     if rule.kind is str and words:
         return ("list of " if rule.many else "") + ", ".join(words) + (" or an import path" if rule.paths else "")
     noun = {float: "number", int: "integer", str: "string or integer ≥ 1" if rule.numbered else "string"}[rule.kind]
@@ -252,14 +252,13 @@ def allowed(rule):
 
 
 def key_row(field):
-    """The row of a key."""
+    """The cells of the row of a key."""
     rule = field.metadata["rule"]
     if field.default is dataclasses.MISSING:
         default = "required"
     else:
-        default = "none" if field.default is None else f"`{quoted(field.default)}`"
-    about = rule.about.replace("|", r"\|")
-    return f"| `{field.name}` | {default} | {allowed(rule)} | {about} |"
+        default = "none" if field.default is None else quoted(field.default)
+    return field.name, default, allowed(rule), rule.about
 
 
 def section_rows(name, kind, need="", shown=None):
@@ -271,8 +270,8 @@ def section_rows(name, kind, need="", shown=None):
     about = kind.__doc__.splitlines()[0]
     if known:
         (section,) = {shown[rows[key]] for key in known}
-        about += f" {', '.join(f'`{key}`' for key in known)}: as in `[{section}]`."
-    yield f"| **`[{name}]`**{need} | | | *{about}* |"
+        about += f" {', '.join(known)}: as in [{section}]."
+    yield f"[{name}]{need}", "", "", about
     yield from (row for row in rows.values() if row not in shown)
     yield from inner_rows(kind, f"{name}.")
     if kind is Model:
@@ -282,7 +281,7 @@ def section_rows(name, kind, need="", shown=None):
             terms |= {key_row(key): terms.get(key_row(key), f"model.{word}")
                       for key in dataclasses.fields(settings_class(word)) if "rule" in key.metadata}
     if kind is Tracers:
-        yield f"| **`[tracers.NAME]`**, optional | | | *A set of tracers; keys: {', '.join(SET_KEYS)}.* |"
+        yield "[tracers.NAME], optional", "", "", f"A set of tracers; keys: {', '.join(SET_KEYS)}."
 
 
 def inner_rows(kind, prefix):
@@ -296,8 +295,9 @@ def inner_rows(kind, prefix):
 def test_scene_reference():
     """The reference has the declarations of the keys."""
     keys = [key_row(field) for field in dataclasses.fields(Scene) if "rule" in field.metadata]
-    rows = ["| key | default | values | meaning |", "|---|---|---|---|", *keys, *inner_rows(Scene, "")]
-    assert marked("scene reference").splitlines() == rows
+    with open(CHECKOUT / "docs/scene-reference.csv", encoding="utf-8", newline="") as file:
+        found = [*csv.reader(file)]
+    assert found == [list(row) for row in (("key", "default", "values", "meaning"), *keys, *inner_rows(Scene, ""))]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

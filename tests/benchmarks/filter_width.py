@@ -19,15 +19,16 @@ from matplotlib.figure import Figure
 
 from eddies.measures import MEASURES
 from eddies.report.summary import in_symbols, is_stable
-from eddies.report.figures import BLUE, DNS, FILTERED, FOURTH, MODEL, SECOND, THIRD, letter, panels, png, styled
+from eddies.report.figures import BLUE, FILTERED, GRID, LOOKS, letter, panels, png, styled
 
 DRAWN = ("velocity_error_half", "acceleration_kl")
 # Label, colour and marker of the variants.
-MARKERS = {"resolved": ("the resolved velocity", MODEL, "o"),
-           "grid": ("best grid of its cost, exact start", BLUE, "s"),
-           "grid-particles": ("the same, start from particles", DNS, "^"),
-           "paper": ("the published form", THIRD, "D"), "transport-velocity": ("transport-velocity SPH", FOURTH, "v"),
-           "local": ("only neighbours", SECOND, "P"), "no-force": ("no force", FILTERED, "x")}
+MARKERS = {"resolved": ("the resolved velocity", *LOOKS["resolved"]),
+           "grid": ("best grid of its cost, exact start", BLUE, GRID),
+           "grid-particles": ("the same, start from particles", "#7db8dc", GRID),
+           "paper": ("the published form", *LOOKS["paper"]),
+           "transport-velocity": ("transport-velocity SPH", *LOOKS["transport-velocity"]),
+           "local": ("only neighbours", *LOOKS["local"]), "no-force": ("no force", *LOOKS["none"])}
 
 Row = Mapping[str, Any]
 

@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 from matplotlib.text import Text
 
-from eddies.report.figures import (BAR, LOOKS, POSITIVE, colour_bar, letter, looks, panels, png, show_plane, styled)
+from eddies.report.figures import (BAR, LOOKS, POSITIVE, WIDEST, colour_bar, letter, looks, panels, png, show_plane,
+                                   styled)
 
 
 def test_drawing_leaves_the_settings_of_the_user(monkeypatch):
@@ -73,3 +74,16 @@ def test_each_method_has_one_colour_and_one_marker():
     assert found["grid-16"][1] == found["grid-32"][1] and found["grid-32"][0] == "#0072b2"
     assert sum(int(found["grid-16"][0][at:at + 2], 16) for at in (1, 3, 5)) > 0x72 + 0xb2  # lighter
     assert looks({"other": ["other", "paper"]}, {})["other"] == LOOKS["paper"]
+
+
+@pytest.mark.parametrize("columns, width", [(2, 6.0), (5, WIDEST), (6, 18.0)])
+def test_up_to_five_panels_fit_into_a_column_of_text(columns, width):
+    figure, _ = panels(2, columns, (3.0, 2.0))
+    assert figure.get_size_inches() == pytest.approx([width, 4.0 * width / (3.0 * columns)])
+
+
+def test_a_plane_has_its_error_in_a_corner_and_colours_by_a_power():
+    _, ((axis,),) = panels(1, 1, (3.0, 3.0))
+    image = show_plane(axis, np.array([[0.0, 1.0], [4.0, 4.0]]), (0, 4), POSITIVE, 0.123, power=0.5)
+    assert [text.get_text() for text in axis.texts] == ["0.12"]
+    assert image.norm(np.array([0.0, 1.0, 4.0])) == pytest.approx([0.0, 0.5, 1.0])

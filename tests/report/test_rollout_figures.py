@@ -6,7 +6,8 @@ import pytest
 from eddies.analysis.pdfs import bin_centres
 from eddies.analysis.velocity_gradients import InvariantBins
 from eddies.report.figures import Variant, png
-from eddies.report.rollout_figures import errors_over_time, invariant_planes, row_at, velocity_planes
+from eddies.report.rollout_figures import (energy_spectra, errors_over_time, invariant_planes, row_at, velocity_planes,
+                                           vorticity_and_energy)
 
 NUMBERS = {"attributes": {"eddy_turnover_time": 1.0}}
 
@@ -43,6 +44,31 @@ def test_planes_are_as_large_with_few_frames(frames):
     assert width == pytest.approx(2.0, abs=0.05)  # inches; the colour bar has room in any case
     assert [len(axis.images) for axis in figure.axes[:3 * frames]] == [1] * (2 * frames + 1) + [0] * (frames - 1)
     assert row_at(short, 0.0) == 0 and row_at(whole, 0.1 * frames) is None
+
+
+def texts(axis):
+    return [text.get_text() for text in axis.texts]
+
+
+def test_planes_have_their_errors_and_a_scale_that_holds_all_models():
+    """The model has three times the values of the truth."""
+    planes = {"time": np.zeros(1), **{f"{name}_truth": np.ones((1, 8, 8)) for name in ("u_x", "vorticity", "energy")}}
+    planes |= {name.replace("truth", "model"): 3 * values for name, values in planes.items() if name != "time"}
+    shown = [drawn("large", {"planes": planes})]
+    assert [texts(axis) for axis in velocity_planes(shown).axes[:2]] == [[], ["2.00"]]
+    *panels, _, _ = vorticity_and_energy(shown).axes
+    assert [texts(axis) for axis in panels] == [[], ["2.00"], [], ["2.00"]]
+    assert {axis.images[0].norm.vmax for axis in panels} == {3.0}
+
+
+def test_spectra_have_ratios_to_the_true_tracers_below():
+    shells = np.arange(9.0)
+    spectra = {"time": np.zeros(1), "energy_truth": np.exp(-shells)[None], "energy_model": 1.5 * np.exp(-shells)[None]}
+    flow = {"wavenumber": shells, "energy_flow": np.exp(-shells)[None], "energy_filtered": np.exp(-shells)[None]}
+    numbers = NUMBERS | {"filter_width": 0.5}
+    figure = energy_spectra([Variant("one", ("#D55E00", "o"), numbers, {"spectra": spectra, "flow_spectra": flow})])
+    truth, model = [line.get_ydata() for line in figure.axes[1].lines[:2]]
+    assert truth == pytest.approx(np.ones(8)) and model == pytest.approx(np.full(8, 1.5))
 
 
 def test_the_density_is_drawn_if_model_and_truth_have_one():

@@ -5,7 +5,7 @@ import pytest
 from eddies.measures import DRAWN, MEASURES
 from eddies.report.figures import looks, png
 from eddies.report.summary import COLUMNS, MOST_NAMED, ErrorAgainstTime, scatter, section
-from eddies.workflows.variant_rows import BEFORE, BREAK_EVEN
+from eddies.workflows.variant_rows import BEFORE
 
 
 def row(name, seconds, error, status="complete", stopped_at=None, kind="particle model"):
@@ -13,8 +13,8 @@ def row(name, seconds, error, status="complete", stopped_at=None, kind="particle
             "status": status, "stopped_at": stopped_at, "end": 1.0,
             "wall_seconds": seconds, "wall_seconds_low": seconds and 0.9 * seconds,
             "wall_seconds_high": seconds and 1.2 * seconds, "core_seconds": seconds,
-            "seconds_per_step": 0.1, "time_step": 0.02,
-            **dict.fromkeys([*BEFORE, *BREAK_EVEN]), **dict.fromkeys(MEASURES, error)}
+            "seconds_per_step": 0.1, "time_step": 0.02, "busy": False,
+            **dict.fromkeys(BEFORE), **dict.fromkeys(MEASURES, error)}
 
 
 ROWS = [row("learned", 20.0, 0.1), row("none", 1.0, 0.5), row("slow", 90.0, 0.2),
@@ -94,6 +94,11 @@ def test_the_section_has_notices_summary_notes_figure_and_table():
 def test_weights_without_their_cost_differ_from_methods_without_weights():
     rows = [{**ROWS[0], "weights": 7}, {**ROWS[1], "weights": 7, "training_seconds": 2.5}, ROWS[2]]
     assert [*section(table_of(rows)).columns["training (s)"].values()] == ["not stored", 2.5, ""]
+
+
+def test_times_of_a_busy_machine_are_marked():
+    rows = [{**ROWS[0], "busy": True}, ROWS[1]]
+    assert [*section(table_of(rows)).columns["seconds a turnover"].values()] == ["20 (busy)", 1.0]
 
 
 def test_one_variant_has_a_row_and_no_figure():

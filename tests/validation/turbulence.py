@@ -35,7 +35,7 @@ from mpi4py import MPI
 from eddies.analysis.isotropic_turbulence import Row, StationarySpan, comparison
 from eddies.io.hdf5 import open_product, read_table
 from eddies.report.figures import (
-    BLUE, DNS, FOURTH, GUIDE, MODEL, SECOND, THIRD, letter, number_wavenumbers, panels, styled,
+    BLUE, DNS, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, looks, number_wavenumbers, panels, styled,
 )
 from eddies.report.page import shown
 from eddies.report.stationary import draw_compensated
@@ -63,7 +63,7 @@ WAVENUMBER = (0.11, 0.15, 0.20, 0.25, 0.30, 0.40, 0.50, 0.70, 1.00, 1.50, 2.00, 
 ENERGY = {98: (25, 55, 106, 196, 195, 202, 168, 127, 79.2, 47.8, 34.6, 28.6, 23.1, 14.3),
           171: (20, 49.7, 92.0, 120, 125, 98.0, 81.5, 60.2, 39.4, 24.1, 16.5, 12.5, 9.12, 5.62)}
 LENGTH, SPEED, MESH, WIND = 11 * 5.08 / (2 * np.pi), 22.2, 5.08, 1000.0  # units of the scene; cm and cm/s
-GRID_COLOURS = (MODEL, SECOND, FOURTH, THIRD, DNS)
+GRID_STYLES = ("--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)), (0, (8, 3)))  # of the lines of grids
 
 
 def read(directory: Path, reader):
@@ -248,13 +248,13 @@ def draw_grid(found: dict[str, dict[int, np.ndarray]], grids: set[str], shells: 
     """Mean spectra of all variants at both stations, with the filtered experiment; dashed: those of grids."""
     figure, axes = panels(1, 2, (4.2, 3.4))
     order = sorted(found, key=lambda name: name in grids)  # grids last
-    count = len(found) - len(grids)
-    colours = dict(zip(order, [*GRID_COLOURS[:count], *GRID_COLOURS[:len(grids)]]))
+    models = looks({name: ["none" if name == "no-force" else name] for name in order if name not in grids}, {})
+    lines = {name: {"color": colour, "linestyle": "-"} for name, (colour, _) in models.items()}
+    lines |= {name: {"color": BLUE, "linestyle": style} for name, style in zip(sorted(grids), GRID_STYLES)}
     for axis, station in zip(axes.flat, ENERGY):
-        axis.loglog(shells, filtered_experiment(station, shells, filter_width), "o", color=BLUE, label="experiment")
+        axis.loglog(shells, filtered_experiment(station, shells, filter_width), "o", color=TRUTH, label="experiment")
         for name in order:
-            axis.loglog(shells, found[name][station].mean(0), "--" if name in grids else "-", color=colours[name],
-                        label=name)
+            axis.loglog(shells, found[name][station].mean(0), **lines[name], label=name)
         axis.set(title=f"$t U_0/M = {station}$", xlabel="$k$", ylabel="$E(k)$")
         number_wavenumbers(axis)
     axes.flat[0].legend(fontsize=7)

@@ -7,12 +7,13 @@ from eddies.io.new_files import python_value
 
 
 def numbers_in(comm, path):
-    """All datasets and attributes below the root of a product, by path, except wall times."""
+    """All datasets and attributes below the root of a product, by path, except wall times and the load."""
     comm.Barrier()
     with h5py.File(path) as file:
         found = {name: value for key, item in file.items() for name, value in below(item, key)}
     comm.Barrier()
-    return {name: value for name, value in found.items() if "seconds" not in name and "storing_share" not in name}
+    of_the_machine = ("seconds", "storing_share", "surplus_load", "switches_per_step")
+    return {name: value for name, value in found.items() if not any(word in name for word in of_the_machine)}
 
 
 def below(item, name):

@@ -87,6 +87,7 @@ def test_the_step_is_the_longest_whose_half_changes_little_of_the_error(comm, sm
     sizes, errors, rms = sizes_and_errors(comm, scene, directory, found["turnovers"], 3.0)
     assert found["size"] == pytest.approx(first_converged(sizes, errors, rms, 3.0)) and found["integrator"] == "rk2"
     assert found["confirmed_on"] == 0
+    assert {"seconds_per_step", "surplus_load", "switches_per_step"} <= found.keys()
     assert trials["size"] == pytest.approx(sizes[:len(trials["size"])])
     assert trials["error"] == pytest.approx(errors[:len(trials["size"])], rel=1e-6)
     assert trials["difference"][1:] == pytest.approx(3.0 * trials["size"][1:] / rms, rel=1e-5)

@@ -14,6 +14,7 @@ import torch
 from eddies.io.new_files import python_value
 from eddies.io.weights import load_weights
 from eddies.learning.training import shared_values
+from eddies.parallel.step_times import NOT_COMPARABLE
 from eddies.scene.model import BUILT_IN_PREFIX, WEIGHTS, built_in_weights
 from eddies.scene.scene import load_scene
 from eddies.stored_run import open_run
@@ -143,14 +144,19 @@ def test_weights_that_come_along_are_as_good_as_their_card_says(run_directory, l
         assert file["source_a_priori/acceleration_error"][-1] == pytest.approx(card["eddies:tiny"], rel=0.01)
 
 
+def doubts(metrics):
+    """The warnings of a report, but those of a machine that is busy with other tests."""
+    return [words for words in metrics["warnings"] if NOT_COMPARABLE not in words]
+
+
 def test_products_say_what_they_were_made_from(run_directory):
     found = {}
     for name in ("ground_truth", "kernel", "model", "rollout"):
         with h5py.File(run_directory / f"{name}.h5") as file:
             found[name] = json.loads(file.attrs["provenance"])
     ids = {name: origin["id"] for name, origin in found.items()}
-    assert len({*ids.values()}) == 4 and json.loads((run_directory / "report" / "metrics.json").read_text())[
-        "warnings"] == []
+    assert len({*ids.values()}) == 4
+    assert doubts(json.loads((run_directory / "report" / "metrics.json").read_text())) == []
     for number, origin in enumerate(found.values()):
         assert origin["made_from"] == dict(list(ids.items())[:number])
 
@@ -191,7 +197,7 @@ def test_a_trained_model_runs_on_another_flow(comm, run_directory, tmp_path):
         assert rollout["start_time"] == pytest.approx(0.1) and python_value(rollout["status"]) == "complete"
     metrics = numbers_of(tmp_path / "run", None)
     shown = metrics["models"]
-    assert metrics["warnings"] == []
+    assert doubts(metrics) == []
     assert shown["acceleration_error"] < 0.95 and shown["source_acceleration_error"] < 0.9
     assert shown["mach_turbulent"] == pytest.approx(2 * shown["source_mach_turbulent"], rel=0.2)
 

@@ -343,6 +343,25 @@ def test_products_that_were_made_from_another_ground_truth_are_named_at_the_top(
 
 
 @pytest.mark.usefixtures("no_figures")
+def test_times_of_a_busy_machine_are_named_at_the_top(comm, tmp_path, capfd):
+    """A load of three more processes than cores in the rollout, and steps of the simulation that differ."""
+    write_run(comm, tmp_path)
+    scene = scene_of(tmp_path).variant["plain"]
+    (tmp_path / "scene.toml").write_text(scene.to_toml())
+    with changed(tmp_path / "rollout.h5") as file:
+        origin = json.loads(file.attrs["provenance"]) | stage_provenance(scene, "simulate") | {"made_from": {}}
+        file.attrs["provenance"] = json.dumps(origin)
+        file["rollout"].attrs.update(seconds_per_step_low=0.03, seconds_per_step_high=0.04, surplus_load=3.0)
+    with changed(tmp_path / "ground_truth.h5") as file:
+        file["statistics/seconds_per_step"][::2] *= 2
+    said = [sentence for sentence in warnings_of(tmp_path, capfd) if "times are not comparable" in sentence]
+    words = "times are not comparable: the machine was busy"
+    assert said == [f"rollouts of {scene.name}: {words}", f"direct simulation: {words}"]
+    metrics, page = written(tmp_path)
+    assert metrics["cost"]["busy"] is True and "(busy)</td>" in page
+
+
+@pytest.mark.usefixtures("no_figures")
 def test_a_rollout_of_other_settings_is_left_out_of_the_comparison(comm, tmp_path, capfd):
     """`eddies status` knows the same. The main page is on a variant that can be compared."""
     scene = scene_of(tmp_path, ("free", 'simulation.method = "none"'))

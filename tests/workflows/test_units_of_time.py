@@ -15,7 +15,7 @@ POWERS = {**dict.fromkeys(("energy", "energy_x", "energy_y", "energy_z", "total_
           **dict.fromkeys(("eddy_turnover_time", "kolmogorov_time", "released_at", "delay", "time_step"), 1),
           **dict.fromkeys(("velocity_rms", "density_rate_rms", "sound_speed", "viscosity"), -1)}
 # Warnings name the time of a product, and the summary that of a turnover.
-OF_THE_COMPUTER = ("second", "storing", "break_even", "date", "warnings", "summary")
+OF_THE_COMPUTER = ("second", "storing", "busy", "surplus_load", "switches", "date", "warnings", "summary")
 
 
 def numbers(values, place=()):

@@ -1,6 +1,5 @@
 """Error against cost: the Pareto front, and sentences that say where a model is worth its cost."""
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -74,17 +73,6 @@ def cheapest_grid(model: Method, grids: Sequence[Method], times: Mapping[str, st
         return f"No grid {limit}."
     best = min(kept, key=lambda row: row[COST])
     return f"The cheapest grid that {limit} is {best['label']}; it costs {best[COST] / model[COST]:.2g} times as much."
-
-
-def break_even(first: float, each: float, rival_first: float, rival_each: float) -> float:
-    """Return the number of turnovers after which a method has taken less time than its rival.
-
-    It is infinite if the method does not take less time for a turnover. `first` is the method's time in seconds before
-    its first turnover, and `each` its time for one turnover; `rival_first` and `rival_each` are those of the rival.
-    """
-    if each >= rival_each:
-        return math.inf
-    return max(0.0, (first - rival_first) / (rival_each - each))
 
 
 def _worse(row: Method, model: Method, key: str) -> bool:

@@ -13,7 +13,7 @@ from eddies.flow.statistics import (
     component_energies, compressible_budget, energy_spectrum, gradient_moments, incompressible_budget,
     turbulence_scales,
 )
-
+from eddies.parallel.step_times import surplus_load
 
 EVERY = 4  # steps between two samples
 #: Units of the columns of a history; the others are pure numbers.
@@ -55,7 +55,8 @@ class FlowHistory:
         row, spectrum = self._measure(state)
         FlowDiverged.unless_finite(row["total_energy"], clock)
         now, steps = time.perf_counter(), max(clock.steps - self._steps, 1)
-        row |= {"turnovers": 0.0, "time": clock.time, "time_step": 0.0, "seconds_per_step": (now - self._wall) / steps}
+        row |= {"turnovers": 0.0, "time": clock.time, "time_step": 0.0, "seconds_per_step": (now - self._wall) / steps,
+                "surplus_load": surplus_load()}
         if self.rows:
             last, elapsed = self.rows[-1], clock.time - self.rows[-1]["time"]
             self._injected += elapsed * row["injection_rate"]

@@ -39,7 +39,7 @@ NAME = re.compile(r"step-(\d{8,})(\.h5)?")
 PLAIN = "plain"  # the dataset of everything that is not an array, as JSON
 # Checkpoints of another format are not used. Raise this number also when FORMAT of io/provenance.py is raised, because
 # the files with the frames of a checkpoint have that format.
-FORMAT = 13
+FORMAT = 14
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_hex, to_rgb
+from matplotlib.colors import PowerNorm, to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 from matplotlib.transforms import Bbox
@@ -27,6 +27,7 @@ SIGNED, POSITIVE = "RdBu_r", "viridis"
 LEFT, RIGHT, BOTTOM, TOP = 0.84, 0.12, 0.5, 0.3  # inches around a panel, for its labels and its title
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 BAR = 0.8  # inches beside a panel for a colour bar with its labels
+WIDEST, MOST_ACROSS = 10.8, 5  # inches, panels: so many panels beside each other remain legible in a column of text
 
 STYLE = {
     "font.size": 10.5, "axes.titlesize": 10.5, "axes.labelsize": 10.5, "legend.fontsize": 9,
@@ -41,7 +42,7 @@ STYLE = {
 # Colour and marker of each method in all figures, by the name of its preset; "none": without any force.
 LOOKS = {"paper": (MODEL, "o"), "resolved": (SECOND, "s"), "local": (THIRD, "D"), "paper-code": (SIXTH, "v"),
          "wcsph": (FOURTH, "^"), "transport-velocity": (FIFTH, "P"), "none": ("#b5a642", "X")}
-OTHERS = list(zip(("#7b3294", "#e7298a", "#66a61e", "#a6761d", "#1b9e77", "#666633"), ">p<d*8"))  # of other methods
+OTHERS = list(zip(2 * ("#7b3294", "#e7298a", "#66a61e", "#a6761d", "#1b9e77", "#666633"), ">p<d*8d*8>p<"))  # of others
 GRID, LIGHTEST = "h", 0.55  # marker of grids; share of white in the blue of the coarsest grid
 WIDE = {"color": TRUTH, "linewidth": 2.2}  # a line of the truth, which is seen beside and behind other lines
 ACROSS = 5  # entries in a line of a legend at the foot of a figure
@@ -80,9 +81,11 @@ def panels(rows: int, columns: int, size: tuple[float, float], right: float = 0.
 
     All lengths are in inches. size: width and height of a panel with its labels. right: room for colour bars, beside
     each panel or, with `sharey`, beside the last one. below: room for a legend below each panel. sharing: `sharex` and
-    `sharey` of `Figure.subplots`.
+    `sharey` of `Figure.subplots`. A figure of up to MOST_ACROSS panels a row is shrunk to a width of WIDEST.
     """
     width, height = size[0] * columns, size[1] * rows
+    if columns <= MOST_ACROSS and width > WIDEST:
+        width, height = WIDEST, height * WIDEST / width
     figure = Figure(figsize=(width, height))
     across, up = RIGHT + right + LEFT, TOP + below + BOTTOM
     if sharing.get("sharey"):
@@ -170,14 +173,19 @@ def looks(methods: Mapping[str, Sequence[str]], cells: Mapping[str, int]) -> dic
     return found
 
 
-def show_plane(axis: Axes, plane: np.ndarray, limits: tuple[float, float], colours: str):
+def show_plane(axis: Axes, plane: np.ndarray, limits: tuple[float, float], colours: str, error: float | None = None,
+               power: float = 1.0):
     """Draw values in a plane [y, x] of the box, and return the image for a colour bar.
 
-    `limits` are the values at the ends of the colour map `colours`.
+    `limits` are the values at the ends of the colour map `colours`. The place of a value between them goes with its
+    `power`. The `error` is written into a corner.
     """
     length = 2 * np.pi
-    image = axis.imshow(plane, origin="lower", extent=(0, length, 0, length), cmap=colours, vmin=limits[0],
-                        vmax=limits[1], interpolation="bilinear", aspect="equal")
+    image = axis.imshow(plane, origin="lower", extent=(0, length, 0, length), cmap=colours,
+                        norm=PowerNorm(power, *limits), interpolation="bilinear", aspect="equal")
+    if error is not None:
+        axis.text(0.04, 0.04, f"{error:.2f}", transform=axis.transAxes, fontsize=9,
+                  bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5})
     ticks = [0, length / 2, length]
     axis.set_xticks(ticks, ["0", "π", "2π"])
     axis.set_yticks(ticks, ["0", "π", "2π"])

@@ -22,7 +22,8 @@ KERNELS = {  # name in the files: start of its keys in the report, name in words
 def shapes(kernels: Mapping[str, np.ndarray]) -> Figure:
     """Draw h^3 W and h^4 dW/dr of each kernel W over r/h; h is the support radius.
 
-    The columns are r_over_h, value_NAME and derivative_NAME, with a NAME in KERNELS.
+    An inset shows W(r)/W(0) of the kernel that was trained without L_g, which may have a peak away from the centre. The
+    columns are r_over_h, value_NAME and derivative_NAME, with a NAME in KERNELS.
     """
     figure, axes = panels(1, 2, (4.4, 3.3))
     for axis, kind in zip(axes.flat, ("value", "derivative")):
@@ -36,6 +37,13 @@ def shapes(kernels: Mapping[str, np.ndarray]) -> Figure:
     axes[0, 1].set(title="Derivative", ylabel=r"$h^4\,dW/dr$")
     axes[0, 0].legend()
     letter(axes.flat)
+    if (flat := kernels.get("value_learned_no_gradient")) is not None:
+        *_, label, colour, style = KERNELS["learned_no_gradient"]
+        inset, inner = axes[0, 0].inset_axes((0.6, 0.3, 0.38, 0.26)), kernels["r_over_h"] <= 0.8
+        inset.plot(kernels["r_over_h"][inner], flat[inner] / flat[0], color=colour, linestyle=style)
+        inset.axhline(1, color="#cccccc", linewidth=0.8)
+        inset.set_title(label + ": $W(r)/W(0)$", fontsize=8)
+        inset.tick_params(labelsize=7.5)
     return figure
 
 
@@ -43,9 +51,9 @@ def shapes(kernels: Mapping[str, np.ndarray]) -> Figure:
 def reconstructed_planes(slices: Mapping[str, np.ndarray], errors: Mapping[str, float]) -> Figure:
     """Draw planes [y, x] of u_x, and below them of du_x/dx: first the truth, then the reconstruction by each kernel.
 
-    A row of planes has one colour scale. The Wendland kernel is left out. The keys of `slices` are truth_QUANTITY and
-    QUANTITY_NAME, and those of `errors` are QUANTITY_error_NAME. QUANTITY is velocity or gradient, and NAME is a name
-    in KERNELS. The errors are written in the titles.
+    A row of planes has one colour scale. The Wendland kernel is left out. The errors are written in the panels. The
+    keys of `slices` are truth_QUANTITY and QUANTITY_NAME, and those of `errors` are QUANTITY_error_NAME. QUANTITY is
+    velocity or gradient, and NAME is a name in KERNELS.
     """
     names = [name for name in KERNELS if f"velocity_{name}" in slices and name != "wendland"]
     figure, axes = panels(2, 1 + len(names), (2.665, 2.675), right=BAR, sharex=True, sharey=True)
@@ -56,8 +64,9 @@ def reconstructed_planes(slices: Mapping[str, np.ndarray], errors: Mapping[str, 
         image = show_plane(row[0], truth, (-limit, limit), SIGNED)
         row[0].set(title="filtered DNS", ylabel="$y$")
         for axis, name in zip(row[1:], names):
-            show_plane(axis, slices[f"{quantity}_{name}"], (-limit, limit), SIGNED)
-            axis.set_title(f"{KERNELS[name][2]}: {float(errors[f'{quantity}_error_{name}']):.3f}")
+            show_plane(axis, slices[f"{quantity}_{name}"], (-limit, limit), SIGNED,
+                       float(errors[f"{quantity}_error_{name}"]))
+            axis.set_title(KERNELS[name][2])
         colour_bar(figure, image, row, symbol)
     for axis in axes[-1]:
         axis.set_xlabel("$x$")
@@ -88,6 +97,6 @@ def section(support: float, kernels: Mapping[str, np.ndarray], slices: Mapping[s
     shown.add_figure(
         "figure-2-reconstruction", "Fields reconstructed from particles (the paper's Fig. 2)",
         lambda: reconstructed_planes(slices, errors),
-        "Plane z = π of an unseen frame. Numbers in titles: normalised error over the whole field. Learned kernel: "
+        "Plane z = π of an unseen frame. Numbers in panels: normalised error over the whole field. Learned kernel: "
         f"velocity {errors['velocity_error_learned']:.3f}, gradient {errors['gradient_error_learned']:.3f}.")
     return shown

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from eddies.analysis import disorder
 from eddies.analysis.against_truth import EDGES
+from eddies.analysis.errors import normalized_l2
 from eddies.analysis.pdfs import bin_centres, gaussian
 from eddies.analysis.velocity_gradients import vieillefosse_line
 from eddies.clock import SAME
@@ -21,6 +22,7 @@ from eddies.report.figures import (BAR, DNS, FILTERED, GUIDE, MODEL, POSITIVE, S
                                    number_wavenumbers, panels, plain_log_ticks, show_plane, styled)
 
 TRUE = "true tracers"
+OUTER_BINS = "outer bins: all beyond"  # a note in panels of PDFs
 Variants = Sequence[Variant]
 
 
@@ -51,7 +53,8 @@ def row_at(table: Table, time: float) -> int | None:
 def velocity_planes(variants: Variants) -> Figure:
     """Draw u_x in planes [y, x], with a row of panels for the truth and for each variant, and a column for each time.
 
-    The planes of the truth determine the colour scale. A panel without a frame of the variant is empty.
+    The planes of the truth determine the colour scale. Each panel of a variant has its normalised L2 difference from
+    the truth. A panel without a frame of the variant is empty.
     """
     truth = variants[0].tables["planes"]
     high, wide = 1 + len(variants), len(truth["time"])
@@ -59,9 +62,10 @@ def velocity_planes(variants: Variants) -> Figure:
                           sharey=True)
     limit = largest(*truth["u_x_truth"])
     for row, ((table,), of, line) in zip(axes, of_all(variants, "planes")):
-        for axis, time in zip(row, truth["time"]):
+        for axis, time, true in zip(row, truth["time"], truth["u_x_truth"]):
             if (at := row_at(table, time)) is not None:
-                image = show_plane(axis, table[f"u_x_{of}"][at], (-limit, limit), SIGNED)
+                plane = table[f"u_x_{of}"][at]
+                image = show_plane(axis, plane, (-limit, limit), SIGNED, _difference(plane, true, of))
             else:
                 axis.set_aspect("equal")
                 note(axis, "no frame", (0.5, 0.5), "axes fraction", (0, 0), ha="center")
@@ -76,13 +80,15 @@ def velocity_planes(variants: Variants) -> Figure:
 @styled
 def vorticity_and_energy(variants: Variants) -> Figure:
     """Draw planes [y, x] of the vorticity magnitude, and below them of the kinetic energy, at the last time of each
-    variant. The truth has the first column of panels, and determines the colour scales."""
+    variant. The truth has the first column of panels. A row has one colour scale, which holds the values of all
+    variants; colours go with the square root. Each panel has its normalised L2 difference from the truth."""
     wide = 1 + len(variants)
     figure, axes = panels(2, wide, (2.1 + 2.1 / wide, 2.9), right=BAR, sharex=True, sharey=True)
     for row, label, column in zip(axes, (r"$|\omega|$", r"$\frac{1}{2}|u|^2$"), ("vorticity", "energy")):
-        limit = largest(variants[0].tables["planes"][f"{column}_truth"][-1])
-        for axis, ((table,), of, line) in zip(row, of_all(variants, "planes")):
-            image = show_plane(axis, table[f"{column}_{of}"][-1], (0, limit), POSITIVE)
+        planes = [(table[f"{column}_{of}"][-1], of, line) for (table,), of, line in of_all(variants, "planes")]
+        limit = largest(*(plane for plane, *_ in planes))
+        for axis, (plane, of, line) in zip(row, planes):
+            image = show_plane(axis, plane, (0, limit), POSITIVE, _difference(plane, planes[0][0], of), power=0.5)
             if column == "vorticity":
                 axis.set_title(line["label"])
             else:
@@ -90,6 +96,11 @@ def vorticity_and_energy(variants: Variants) -> Figure:
         colour_bar(figure, image, row, label, extend="max")
         row[0].set_ylabel("$y$")
     return figure
+
+
+def _difference(plane: np.ndarray, truth: np.ndarray, of: str) -> float | None:
+    """Return the normalised L2 difference of a plane from the truth; None for the truth itself."""
+    return None if of == "truth" else normalized_l2(plane, truth)
 
 
 @styled
@@ -145,6 +156,7 @@ def particle_pdfs(variants: Variants) -> Figure:
         probabilities = variants[0].tables[f"{quantity}_pdfs"]["truth"]
         row[0].set_ylim(0.4 * (probabilities[probabilities > 0].min() / width[0]), 2)
         row[0].set_ylabel(f"{quantity} PDF")
+        note(row[0], OUTER_BINS, (0, 1), "axes fraction", (3, -10), fontsize=8)
     legend_at_foot(figure, axes[0, 0])
     letter(axes.flat)
     return figure
@@ -153,25 +165,31 @@ def particle_pdfs(variants: Variants) -> Figure:
 @styled
 def energy_spectra(variants: Variants) -> Figure:
     """Draw spectra of the variants and the true tracers at several times, each with the DNS spectra of the nearest
-    stored time."""
+    stored time, and below them the ratios of the variants to the true tracers."""
     truth, flow = variants[0].tables["spectra"], variants[0].tables["flow_spectra"]
     cutoff, times, known = np.pi / variants[0].numbers["filter_width"], truth["time"], flow["wavenumber"] >= 1
-    figure, axes = panels(1, len(times), (3.5, 3.4) if len(times) > 1 else (5.6, 3.8), sharex=True, sharey=True)
-    for number, (axis, time) in enumerate(zip(axes.flat, times)):
+    figure, axes = panels(2, len(times), (3.5, 2.9) if len(times) > 1 else (5.6, 3.2), sharex=True, sharey="row")
+    for number, (axis, ratio, time) in enumerate(zip(*axes, times)):
         for column, line in (("energy_flow", {"color": DNS, "linewidth": 1, "linestyle": ":", "label": "DNS"}),
                              ("energy_filtered", {"color": FILTERED, "linewidth": 1.3, "linestyle": "--",
                                                   "label": "filtered DNS"})):
             axis.loglog(flow["wavenumber"][known], flow[column][number][known], **line)
         for (table,), of, line in of_all(variants, "spectra"):
             if (at := row_at(table, time)) is not None:
-                energy = table[f"energy_{of}"][at][1:]
-                axis.loglog(np.arange(1, len(energy) + 1), energy, **{"linewidth": 1.1, **line})
+                energy, true = table[f"energy_{of}"][at][1:], truth["energy_truth"][number][1:]
+                shells = np.arange(1, len(energy) + 1)
+                axis.loglog(shells, energy, **{"linewidth": 1.1, **line})
+                ratio.loglog(shells, energy / np.where(true > 0, true, np.nan), **{"linewidth": 1.1, **line})
         mark_cutoff(axis, cutoff)
-        axis.set(title=f"$t = {time / turnover_of(variants):.2f}\\,T$", xlabel="wavenumber $k$")
-        number_wavenumbers(axis)
+        mark_cutoff(ratio, cutoff)
+        axis.set(title=f"$t = {time / turnover_of(variants):.2f}\\,T$")
+        ratio.set(xlabel="wavenumber $k$")
+        number_wavenumbers(ratio)
     peak, top = truth["energy_truth"][:, 1:].max(), 1.5 * truth["energy_truth"].shape[1]
     guide_power_law(axes[0, 0], (2, min(10, 0.7 * top)), 2.2 * peak, -5 / 3, r"$k^{-5/3}$")
     axes[0, 0].set(ylabel="$E(k)$", ylim=(1e-6 * peak, 6 * peak), xlim=(0.9, max(top, 2)))
+    axes[1, 0].set(ylabel="$E(k)$ / true tracers", ylim=(0.2, 5))
+    plain_log_ticks(axes[1, 0].yaxis)
     legend_at_foot(figure, axes[0, 0])
     letter(axes.flat)
     return figure

@@ -42,10 +42,12 @@ REASONS = {
 # Figures: name of the file, table that a variant needs for it, function, title, caption.
 FIGURES: tuple[tuple[str, str, Callable[[Sequence[Variant]], Figure], str, str], ...] = (
     ("figure-4-velocity", "planes", draw.velocity_planes, "Velocity over time (the paper's Fig. 4)",
-     "u_x in the plane z = π, of true tracers and models from {words}."),
+     "u_x in the plane z = π, of true tracers and models from {words}. Numbers in panels: normalised L2 difference "
+     "from the truth in the plane."),
     ("figure-5-vorticity-energy", "planes", draw.vorticity_and_energy,
      "Vorticity and kinetic energy (the paper's Fig. 5)",
-     "Plane z = π at the last common time, of true tracers and models from {words}."),
+     "Plane z = π at the last common time, of true tracers and models from {words}. Numbers in panels: normalised L2 "
+     "difference from the truth in the plane. Colours go with the square root of the value."),
     ("figure-6-pdfs", "errors", draw.particle_pdfs, "PDFs of velocity and acceleration (the paper's Fig. 6)",
      "All components, centred and divided by the truth's standard deviation at that time. Values beyond the axis count "
      "in the last bins."),
@@ -55,7 +57,8 @@ FIGURES: tuple[tuple[str, str, Callable[[Sequence[Variant]], Figure], str, str],
      "⟨Q_w⟩ = ⟨W:W⟩/2. Bottom: mean motion over all frames until then."),
     ("figure-8-spectra", "spectra", draw.energy_spectra, "Energy spectra over time (the paper's Fig. 8)",
      "Spectra of the solenoidal modes that a least-squares fit finds in the velocities of the models' particles and of "
-     "the true tracers. Dotted and dashed: the DNS itself. k_d = π/d is the filter wavenumber."),
+     "the true tracers. Dotted and dashed: the DNS itself. Bottom: ratios to the true tracers. k_d = π/d is the filter "
+     "wavenumber."),
     ("figure-9-errors", "errors", draw.errors_over_time, "Rollout over time",
      "Dashed: particles that keep the true velocity of the first frame. Dotted: an error as large as the velocity "
      "itself."),

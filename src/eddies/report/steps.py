@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from eddies.parallel.step_times import was_busy
 from eddies.report.figures import Variant, legend_at_foot, letter, panels, plain_log_ticks, styled
 from eddies.report.page import Section
 
@@ -15,8 +16,8 @@ LABELS = {"size": "step (on a grid: Courant number)", "seconds": "seconds of the
 
 
 def numbers_of(search: Variant) -> dict[str, Any]:
-    """Return the chosen step of a search with its error and cost, and those of each trial."""
-    return {**{key: search.numbers[key] for key in CHOSEN}, **{f"{name}_{step:.4g}": {
+    """Return the chosen step of a search with its error and cost, whether the machine was busy, and the trials."""
+    return {**{key: search.numbers[key] for key in CHOSEN}, "busy": was_busy(search.numbers), **{f"{name}_{step:.4g}": {
         "error": error, "change from twice the step": change, "seconds a turnover": seconds}
         for name, columns in search.tables.items()
         for step, error, change, seconds in zip(*(columns[key] for key in (

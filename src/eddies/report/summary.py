@@ -107,10 +107,13 @@ def _notice(row: Row) -> str:
 def _with_spread(row: Row, column: str) -> Any:
     """Return the number of a row in a column, with its standard deviation over realisations if this is known.
 
-    If the file of a trained model lacks the cost of its training, return "not stored" for this cost.
+    If the file of a trained model lacks the cost of its training, return "not stored" for this cost. A time that was
+    measured on a busy machine is marked.
     """
     if column == "training_seconds" and row[column] is None:
         return "not stored" if row["weights"] is not None else ""
+    if column == COST and row["busy"]:
+        return f"{row[column]:.3g} (busy)"
     spread = row.get(f"{column}_spread")
     return row[column] if spread is None else f"{row[column]:.3g} ± {spread:.2g}"
 
@@ -123,8 +126,7 @@ def scatter(table: ErrorAgainstTime, measures: Sequence[str]) -> Figure:
     styles = [_entry(table.looks[row["name"]], row["label"]) for row in drawn if not row["on_grid"]]
     if grids := [row["name"] for row in drawn if row["on_grid"]]:
         styles.append(_entry(table.looks[grids[-1]], "coarse grids, the finer the darker"))
-    if table.stopped():
-        styles.append(_entry((DNS, "x"), "unstable"))
+    styles += [_entry((table.looks[row["name"]][0], "x"), f"{row['label']}, unstable") for row in table.stopped()]
     styles.append(Line2D([], [], color=GUIDE, linestyle="--", label="Pareto front"))
     figure, axes = panels(-(-len(measures) // columns), columns, (5.4, 4.2) if columns == 2 else (9.3, 6.0))
     for axis in axes.flat[len(measures):]:

@@ -20,9 +20,9 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -35,6 +35,7 @@ from eddies.io.hdf5 import Table, create_product, write_table
 from eddies.io.new_files import set_attributes
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import IdOrder
+from eddies.parallel.step_times import StepTimes
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.particles.exchanges import fluctuations, relative_error
@@ -99,12 +100,14 @@ class Trial:
     stretch : the part of a ground truth that the rollout covers.
     seconds : wall time per turnover time of the flow; nothing is stored.
     velocity : the final velocity in order of id; None if the rollout failed.
+    timed : numbers of `StepTimes` on its steps.
     """
 
     stretch: Stretch
     step: TimeStep
     seconds: float
     velocity: np.ndarray | None = None
+    timed: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def error(self) -> float:
@@ -247,7 +250,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             "integrator": found.step.integrator, "size": found.step.size, "seconds_per_turnover": found.seconds,
             "error": found.error, "error_with_half": half.error, "difference": difference,
             "tolerance": half.tolerance, "seconds": seconds, "confirmed_on": len(truths) - 1,
-            "turnovers": span / stretches[0].turnover})
+            "turnovers": span / stretches[0].turnover, **found.timed})
         for name, table in tables.items():
             write_table(file, f"trials/{name}", Table(table, units={
                 "seconds_per_turnover": "s", **({} if settings.form.on_grid else {"size": "T"})}))
@@ -286,12 +289,14 @@ def short_rollout(method: Method, step: TimeStep, stretch: Stretch, stop: StopRe
     """
     comm, total = stretch.truth.decomposition.comm, stretch.truth.total
     method.frame(0.0)  # the rates at the start, which the first step uses
-    began, number, complaint = time.perf_counter(), 0, None
+    began, number, complaint, timed = time.perf_counter(), 0, None, StepTimes()
     for until in stretch.stops:
         while complaint is None and method.time < until - ROUND_OFF * stretch.stops[0]:
             stop.check()
             number += 1
+            timed.begin()
             complaint = method.advance(until, number)
+            timed.end()
     seconds = comm.bcast((time.perf_counter() - began) * stretch.turnover / max(method.time, 1e-300))
     if complaint is not None:
         log.info("find-step: %s %.4g%s is unstable: %s", step.integrator, step.size, stretch.name, complaint)
@@ -299,7 +304,7 @@ def short_rollout(method: Method, step: TimeStep, stretch: Stretch, stop: StopRe
     particles, _ = method.frame(float(stretch.stops[-1]))
     columns = particles.to_numpy()
     velocity = IdOrder(comm, columns["id"], total).apply(columns["velocity"])
-    trial = Trial(stretch, step, seconds, velocity)
+    trial = Trial(stretch, step, seconds, velocity, timed.numbers(comm))
     log.info("find-step: %s %.4g%s: error %.4f, %.3g s per turnover", step.integrator, step.size, stretch.name,
              trial.error, seconds)
     return trial

@@ -29,6 +29,7 @@ from eddies.io.provenance import (others_trained_on, product_attributes, product
 from eddies.io.trajectories import Trajectory
 from eddies.measures import finite
 from eddies.parallel.communicator import Comm
+from eddies.parallel.step_times import NOT_COMPARABLE, quartiles, was_busy
 from eddies.parallel.stop import StopRequest
 from eddies.pipeline import FILE_OF, MAKER_OF
 from eddies.report import (figures, ground_truth, kernel, models, reconstruction, rollouts, stationary, steps, summary,
@@ -41,7 +42,7 @@ from eddies.workflows.ground_truth.stationary import read_stationary_span
 from eddies.workflows.problems import directory_problems
 from eddies.workflows.product_warnings import doubts, not_finite, old_products
 from eddies.workflows.run_directory.work import read_stage_seconds
-from eddies.workflows.variant_rows import (COLUMNS, ROLLOUT, add_break_even, machine, notes, numbers, rows_of,
+from eddies.workflows.variant_rows import (COLUMNS, ROLLOUT, machine, notes, numbers, rows_of,
                                            simulation_seconds)
 from eddies.workflows.variants import rollouts as rollouts_of
 
@@ -51,7 +52,7 @@ MOST_SHOWN = 6  # largest number of variants in the figures
 SIMULATION = "dns_seconds_per_turnover"
 COSTS = {"dns_seconds_per_step": "DNS: seconds of a step (median, without storing)",
          SIMULATION: "DNS: wall seconds per turnover (median step, mean number of steps)",
-         "stage_seconds": "wall seconds by stage"}
+         "busy": "the machine was busy", "stage_seconds": "wall seconds by stage"}
 REASONS = {SIMULATION: "the simulation took no step",
            "stage_seconds": "no stage_seconds.json: the stages were not run by `eddies`"}
 SOURCE_OF_TRACKS = ("{in_file} measured tracks from {file}, on average {mean_count:.0f} in a frame; {complete} are in "
@@ -241,6 +242,7 @@ def _make(report: Report, ranks: int, alone: Comm) -> None:
         key: {stage: origin[key] for stage, origin in stages.items()}
         for key in ("wall seconds", "ranks", "date", "eddies", "commit", "libraries")}))
     report.numbers["warnings"] = [*doubts(report.base, report.provenance, report.old), *_other_doubts(report),
+                                  *_busy_times(report.numbers),
                                   *(words for words in report.scanned.values() if words)]
 
 
@@ -345,10 +347,14 @@ def _middle_planes(file: File) -> dict[str, np.ndarray]:
 def _simulation_cost(file: File) -> dict[str, Any]:
     """Return the cost of the steps of the direct simulation in an open ground_truth.h5."""
     statistics, turnover = read_table(file, "statistics"), file["reference"].attrs["eddy_turnover_time"]
-    seconds = float(np.median(statistics["seconds_per_step"]))
+    timed = quartiles(statistics["seconds_per_step"])
+    if "surplus_load" in statistics:
+        timed["surplus_load"] = float(np.median(statistics["surplus_load"]))
+    seconds = float(timed["seconds_per_step"])
     elapsed = np.diff(statistics["time"])
     steps = (elapsed / statistics["time_step"][1:]).sum() / elapsed.sum() * turnover if len(elapsed) else None
-    return {"dns_seconds_per_step": seconds, SIMULATION: None if steps is None else float(steps) * seconds}
+    return {"dns_seconds_per_step": seconds, SIMULATION: None if steps is None else float(steps) * seconds,
+            "busy": was_busy(timed)}
 
 
 def _other_doubts(report: Report) -> Iterator[str]:
@@ -357,6 +363,16 @@ def _other_doubts(report: Report) -> Iterator[str]:
         beside = {kind: origin for kind in MAKER_OF if (origin := product_provenance(where / FILE_OF[kind]))}
         yield from (f"{where.relative_to(report.directory)}: {sentence}"
                     for sentence in doubts(where, beside, report.old) if sentence.startswith(ROLLOUT))
+
+
+def _busy_times(numbers: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a sentence on each kind of time in metrics.json that was measured on a busy machine."""
+    for kind, busy in (("rollouts of ", [row["label"] for row in numbers.get("rows", ()) if row["busy"]]),
+                       ("searches for the step of ", [name for name, each in numbers.get("steps", {}).items()
+                                                      if each["busy"]]),
+                       ("", ["direct simulation"] if numbers["cost"].get("busy") else [])):
+        if busy:
+            yield f"{kind}{', '.join(busy)}: {NOT_COMPARABLE}"
 
 
 def _compare(report: Report, measures: Mapping[Path, Sequence[Any]], of_truth: float | None, ranks: int,
@@ -372,7 +388,6 @@ def _compare(report: Report, measures: Mapping[Path, Sequence[Any]], of_truth: f
     rows, another = rows_of(scene, report.variants, found, alone, report.old)
     repeating = [name for name, each in variants.items() if each.coarse_cells == each.flow.cells]
     simulation = simulation_seconds(rows, repeating, of_truth)
-    add_break_even(rows, simulation)
     table = summary.ErrorAgainstTime(rows, report.shown[0], report.looks)
     reference = product_attributes(report.base / FILE_OF["ground_truth"], "reference")
     flow = {key: finite(float(value)) for key, value in reference.items() if isinstance(value, (float, np.number))}

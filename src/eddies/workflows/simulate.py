@@ -4,8 +4,6 @@
 """
 
 import logging
-import time
-from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -13,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from eddies.clock import ROUND_OFF, WARM_UP_STEPS, Clock, ProgressLine, pace_in_words
+from eddies.clock import ROUND_OFF, Clock, ProgressLine, pace_in_words
 from eddies.io.checkpoint import Checkpoint, Guard
 from eddies.io.frame_segments import FrameLayout, FrameSegments, TrajectoryLayout
 from eddies.io.hdf5 import Table, create_product, write_table
@@ -21,6 +19,7 @@ from eddies.io.new_files import set_attributes
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import IdOrder, wrap
 from eddies.parallel.reduction import global_sum
+from eddies.parallel.step_times import StepTimes
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.particles.particle_set import as_numpy
@@ -97,8 +96,7 @@ class Course:
                  saved: Checkpoint | None) -> None:
         self.method, self.segments, self.count, self.interval, self.guard = method, segments, count, interval, guard
         self.comm, self.times = segments.comm, []
-        self.clock, self.seconds, self.energy = Clock(count * interval), [], 0.0
-        self._warm_up = WARM_UP_STEPS
+        self.clock, self.timed, self.energy = Clock(count * interval), StepTimes(), 0.0
         if saved is not None:
             self._load(saved)
             method.load_state_dict(saved)
@@ -119,7 +117,7 @@ class Course:
 
         Returns attributes of the product: `status`, the `time` of the last frame, and the number of `steps`. If a step
         was taken, there are also the mean `time_step`, and `storing_share`, the share of the wall time that storing
-        took. If a step was timed, the attributes of `quartiles` are added.
+        took. If a step was timed, the numbers of `StepTimes` are added.
         """
         complaint: str | None = None
         if not self.times:
@@ -140,12 +138,12 @@ class Course:
         step = {"time_step": self.clock.time / self.steps,
                 "storing_share": self.progress.storing_share} if self.steps else {}
         return {"status": "complete" if complaint is None else f"stopped: {complaint}", "time": self.times[-1],
-                "steps": self.steps, **step, **quartiles(self.seconds)}
+                "steps": self.steps, **step, **self.timed.numbers(self.comm)}
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state for a checkpoint, without the frames, which have files of their own."""
         return {"rollout": {"clock": self.clock.state_dict(), "energy": self.energy, "ranks": self.comm.size,
-                            "seconds": self.seconds, "times": self.times},
+                            "timed": self.timed.rows, "times": self.times},
                 **self.method.state_dict()}
 
     def _load(self, saved: Checkpoint) -> None:
@@ -154,16 +152,15 @@ class Course:
         self.clock.load_state_dict(state["clock"])
         self.times, self.energy = state["times"], state["energy"]
         if state["ranks"] == self.comm.size:  # wall times on another number of ranks differ
-            self.seconds = state["seconds"]
+            self.timed.rows = state["timed"]
 
     def _step(self, until: float) -> str | None:
-        began, before = time.perf_counter(), self.method.time
+        before = self.method.time
+        self.timed.begin()
         complaint = self.method.advance(until, self.steps + 1)
         if complaint is None:
             self.clock.tick(self.method.time - before)
-            self._warm_up -= 1
-            if self._warm_up < 0:
-                self.seconds.append(time.perf_counter() - began)
+            self.timed.end()
         return complaint
 
     def _store(self, at: float) -> None:
@@ -188,12 +185,3 @@ class Course:
 
     def _describe(self) -> str:
         return f"t {self.clock.time:.4g}  energy {self.energy:.4g}{self.method.status()}"
-
-
-def quartiles(seconds: Sequence[float]) -> dict[str, float]:
-    """Return the median of the wall seconds of timed steps, `seconds_per_step`, and their quartiles,
-    `seconds_per_step_low` and `seconds_per_step_high`. Without timed steps the result is empty."""
-    if not seconds:
-        return {}
-    low, median, high = np.quantile(seconds, (0.25, 0.5, 0.75))
-    return {"seconds_per_step": median, "seconds_per_step_low": low, "seconds_per_step_high": high}

@@ -1,6 +1,5 @@
 """The rows of the table of variants, and a description of the machine on which the times were measured."""
 
-import math
 import os
 import platform
 from collections.abc import Collection, Mapping, Sequence
@@ -11,29 +10,27 @@ from typing import Any
 
 import numpy as np
 
-from eddies.analysis.pareto import break_even
 from eddies.cores import threads
 from eddies.io.hdf5 import open_product
 from eddies.io.provenance import environment, read_json
 from eddies.measures import MEASURES, finite
 from eddies.parallel.communicator import Comm
+from eddies.parallel.step_times import was_busy
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import FAILURE, of_other_settings, read_found_step, step_path
 
 COST = ("seconds_per_step", "time_step", "wall_seconds", "wall_seconds_low", "wall_seconds_high", "core_seconds",
-        "ranks")
+        "surplus_load",
+        "switches_per_step", "ranks")
 # The search for the step: integrator and step ("etdrk4" and a Courant number on a grid), wall seconds of the search,
 # and the errors of short rollouts with this step, with half of it and with twice this step.
 SEARCH = ("step_integrator", "step_size", "step_seconds", "step_error", "step_error_half", "step_error_twice")
 BEFORE = ("weights", "training_seconds", "training_steps", *SEARCH)  # cost before the rollout
 THROUGH_KERNEL = ("qr_kl", "qr_kl_floor")  # measured on gradients that the smoothing kernel reconstructs
-# Number of turnovers after which training, search and rollout together have taken less time than a rival, or "never".
-# The first rival is the direct simulation. The second is the fastest grid with at most the same velocity error.
-BREAK_EVEN = ("break_even_simulation", "break_even_grid")
 COLUMNS = ("name", "label", "method", "kind", "on_grid", "status", "stopped_at", "realisations", *MEASURES, "end",
-           *COST, *BEFORE, *BREAK_EVEN, *(f"{measure}_spread" for measure in MEASURES), "settings")
+           *COST, "busy", *BEFORE, *(f"{measure}_spread" for measure in MEASURES), "settings")
 MODEL, ROLLOUT = STAGES["train"].file, STAGES["simulate"].file
 
 
@@ -92,7 +89,7 @@ def combined(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     Each measure becomes a mean and a standard deviation, if all realisations have it. Each time becomes a median. Of
     the lower quartiles the lowest is kept, and of the upper quartiles the highest. The status comes from the first
-    realisation that did not reach its end, if there is one.
+    realisation that did not reach its end, if there is one. The machine was busy if it was in one realisation.
     """
     found: dict[str, Any] = {"realisations": len(realised), "status": "complete"}
     found |= next(({key: one[key] for key in ("status", "stopped_at")} for one in realised
@@ -106,6 +103,7 @@ def combined(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         values = [one[key] for one in realised if one.get(key) is not None]
         choose = {"wall_seconds_low": min, "wall_seconds_high": max}.get(key, np.median)
         found[key] = float(choose(values)) if values else None
+    found["busy"] = any(one.get("busy") for one in realised)
     return found
 
 
@@ -119,32 +117,6 @@ def simulation_seconds(rows: Sequence[Mapping[str, Any]], repeating: Collection[
     """
     repeated = [row["wall_seconds"] for row in rows if row["wall_seconds"] is not None and row["name"] in repeating]
     return min(repeated, default=of_truth)
-
-
-def add_break_even(rows: Sequence[dict[str, Any]], simulation: float | None) -> None:
-    """Add the numbers of turnovers BREAK_EVEN to the rows of trained methods.
-
-    Each trained method is compared with the direct simulation, and with the fastest grid whose mean velocity error is
-    not larger. The error is that at T/2 or, if no rollout reaches T/2, that at the end. The time of a method includes
-    its training. The times of methods and grids include the search for the step.
-
-    simulation: wall seconds per turnover of the direct simulation; None if unknown.
-    """
-    known = [row for row in rows if row["status"] == "complete" and row["wall_seconds"] is not None]
-    measure = "velocity_error_half" if any(row["velocity_error_half"] is not None for row in known) else (
-        "velocity_error_end")
-    for row in known:
-        if row["training_seconds"] is None or row[measure] is None:
-            continue
-        method = row["training_seconds"] + (row["step_seconds"] or 0.0), row["wall_seconds"]
-        grids = [grid for grid in known if grid["on_grid"] and grid is not row and grid[measure] is not None
-                 and grid[measure] <= row[measure]]
-        rivals = {"break_even_simulation": [] if simulation is None else [(0.0, simulation)],
-                  "break_even_grid": [(grid["step_seconds"] or 0.0, grid["wall_seconds"]) for grid in grids]}
-        for key, costs in rivals.items():
-            if costs:
-                turnovers = break_even(*method, *min(costs, key=lambda cost: cost[1]))
-                row[key] = turnovers if math.isfinite(turnovers) else "never"
 
 
 def before(model: Path | None, step: Path | None, alone: Comm) -> dict[str, Any]:
@@ -192,7 +164,8 @@ def notes(seeds: Sequence[int], without_kernel: Sequence[str], variants: Mapping
 def numbers(measured: Mapping[str, Any]) -> dict[str, Any]:
     """Return status, accuracy and cost of a rollout from the numbers of its measures.
 
-    Costs are the seconds per step, and per turnover the wall seconds (with quartiles) and the core seconds.
+    Costs are the seconds per step, and per turnover the wall seconds (with quartiles) and the core seconds. `busy`
+    tells whether the machine was busy while they were measured.
     """
     rollout, ranks = measured["attributes"], measured["ranks"]
     found = {"status": rollout["status"], "ranks": ranks, **measured["accuracy"],
@@ -202,7 +175,9 @@ def numbers(measured: Mapping[str, Any]) -> dict[str, Any]:
         steps = rollout["eddy_turnover_time"] / rollout["time_step"]
         seconds, low, high = (rollout[f"seconds_per_step{end}"] for end in ("", "_low", "_high"))
         found |= {"seconds_per_step": seconds, "wall_seconds": seconds * steps, "wall_seconds_low": low * steps,
-                  "wall_seconds_high": high * steps, "core_seconds": seconds * steps * ranks * threads()}
+                  "wall_seconds_high": high * steps, "core_seconds": seconds * steps * ranks * threads(),
+                  "surplus_load": rollout.get("surplus_load"), "switches_per_step": rollout.get("switches_per_step"),
+                  "busy": was_busy(rollout)}
     return found
 
 
