@@ -86,4 +86,4 @@ def test_a_plane_has_its_error_in_a_corner_and_colours_by_a_power():
     _, ((axis,),) = panels(1, 1, (3.0, 3.0))
     image = show_plane(axis, np.array([[0.0, 1.0], [4.0, 4.0]]), (0, 4), POSITIVE, 0.123, power=0.5)
     assert [text.get_text() for text in axis.texts] == ["0.12"]
-    assert image.norm(np.array([0.0, 1.0, 4.0])) == pytest.approx([0.0, 0.5, 1.0])
+    assert image.norm(np.array([0.0, 1.0, 4.0])).tolist() == pytest.approx([0.0, 0.5, 1.0])
