@@ -245,9 +245,9 @@ def shares_within(case: Case, directory: Path, truth: h5py.File) -> dict[str, fl
         fields, highest = file["fields/reconstructed"], file["about"].attrs["highest_wavenumber"]
         axis = np.arange(fields.attrs["cells"]) / fields.attrs["cells"] * BOX
         for time, exact in zip(filtered["time"][()], filtered["velocity"]):
-            if time < float(reference["kolmogorov_time"]):
-                continue
             frame = int(np.argmin(np.abs(fields["time"][()] - time)))
+            if abs(fields["time"][frame] - time) > 1e-6 or time < float(reference["kolmogorov_time"]):
+                continue
             for name, true in zip(("velocity", "gradient"), at_points(exact, BOX, axis, undone, highest)):
                 deviation = fields[f"{name}_deviation"][frame]
                 error = np.abs(fields[name][frame] - true.reshape(deviation.shape))

@@ -22,7 +22,7 @@ from eddies.workflows.track_source import Source
 log = logging.getLogger("eddies")
 
 MOST_RADIUS = 0.499 * BOX_LENGTH    # of a kernel: a particle must have one image within it
-FRAMES = 10          # most frames that methods with a memory see; errors are those of the second half
+FRAMES = 30          # most frames that methods with a memory see, which gains for 20; errors are of the second half
 LEAST_TRACKS = 2     # smallest number of tracks that are left out
 MOST_TRACKS = 1e5    # largest mean number of tracks that are compared: one rank triangulates all of them
 IMAGES = 2.5         # thickness of the layer of periodic images around a box for the triangulation, in mean spacings
