@@ -111,7 +111,7 @@ def _errors(scene: Scene, source: Source, methods: tuple[str, ...], found: list[
         if source.velocity_noise > 0:
             missed["floor"] = source.velocity_noise * np.sqrt(exact.size)
         rows.append({"tracks": float(len(exact)), **{
-            name: value / size if size > 0 else np.nan for name, value in missed.items()}})
+            name: float(value / size) if size > 0 else np.nan for name, value in missed.items()}})
     means = {name: float(np.mean([row[name] for row in rows])) for name in (rows[0] if rows else ())}
     return {name: value for name, value in means.items() if np.isfinite(value)}
 
