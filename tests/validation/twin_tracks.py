@@ -4,10 +4,13 @@
     mpirun -n 2 .venv/bin/python tests/validation/twin_tracks.py hit runs/tracks [runs/tracks-3 ...]
     mpirun -n 2 .venv/bin/eddies dns tests/validation/tracks-256.toml
     mpirun -n 2 .venv/bin/python tests/validation/twin_tracks.py hit-256 runs/tracks-256
+    mpirun -n 2 .venv/bin/eddies dns tests/validation/tracks-small.toml
+    mpirun -n 2 .venv/bin/python tests/validation/twin_tracks.py hit-small runs/tracks-small
 
 Writes the tracks of each case as a user would have them, reconstructs them, and compares the fields, after the filter
 of the stored ones, with these. Then forecasts the flow from the first field: the model `resolved` with weights of
 another flow of `hit`, and grids that start from the particles. At last trains `resolved` on tracks of the whole flow.
+On the flow of `hit-small` it measures the shares of errors that are within the standard deviations of the error map.
 Prints means over the runs, of fields at all times after the first t_eta, and the standard deviations of several runs,
 and writes docs/results/tracks-NAME.json.
 """
@@ -20,6 +23,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import h5py
@@ -49,8 +53,13 @@ class Case:
     inner: float = 1.0
 
 
+SAMPLES = 16    # of the error map
 SETS = {"hit": ("whole-8", "whole-16", "whole-32", "filtered-8", "filtered-16", "filtered-32"),
-        "hit-256": ("whole-16", "whole-32", "filtered-16", "filtered-32")}
+        "hit-256": ("whole-16", "whole-32", "filtered-16", "filtered-32"), "hit-small": ()}
+# Those whose error maps are compared with the errors.
+MAPPED = {"hit-small": [Case(f"{kind}-{side}", method, noise) for kind in ("whole", "filtered")
+                        for side, noise in ((8, 0.0), (16, 0.0), (32, 0.0), (16, 0.1))
+                        for method in ("least-squares", "memory")]}
 # Done to the tracks of `hit` alone.
 FURTHER = [
     *(Case(name, method) for name in ("whole-16", "filtered-32") for method in ("kriging", "average")),
@@ -91,9 +100,9 @@ frame_interval = 0.1
 turnovers = 0.5
 [variant.resolved]
 """
-LEARNED = {"hit": ("whole-16", "whole-32"), "hit-256": ()}
+LEARNED = {"hit": ("whole-16", "whole-32")}
 WEIGHTS = {"hit": {"filtered-16": "eddies:hit-coarse", "filtered-32": "eddies:hit"},
-           "hit-256": {"filtered-16": "eddies:hit-256", "filtered-32": "eddies:hit-256"}}
+           "hit-256": {"filtered-16": "eddies:hit-256", "filtered-32": "eddies:hit-256"}, "hit-small": {}}
 COLUMNS = "velocity_error_early", "velocity_error_half", "velocity_error_end", "end", "wall_seconds"
 
 
@@ -143,10 +152,10 @@ def errors_of(case: Case, directory: Path, truth: h5py.File) -> dict[str, np.nda
                 continue
             axis = np.arange(cells) / cells * BOX
             inside = np.flatnonzero(np.abs(axis - np.pi) <= case.inner * BOX / 2 * (1 if case.inner == 1 else 0.9))
-            own = at_points(fields["velocity"][frame], edge, axis[inside] + corner[0], width)
-            true = at_points(exact, BOX, axis[inside], 0.0)
-            pressure = at_points(fields["pressure"][frame], edge, axis[inside] + corner[0], width)[0]
-            by_density = at_points(density, BOX, axis[inside], 0.0)[0] * float(reference["sound_speed"]) ** 2
+            own = at_points(fields["velocity"][frame], edge, axis[inside] + corner[0], width**2)
+            true = at_points(exact, BOX, axis[inside])
+            pressure = at_points(fields["pressure"][frame], edge, axis[inside] + corner[0], width**2)[0]
+            by_density = at_points(density, BOX, axis[inside])[0] * float(reference["sound_speed"]) ** 2
             pairs = {"velocity": (own[0], true[0]), "gradient": (own[1], true[1]),
                      "pressure": (pressure - pressure.mean(), by_density - by_density.mean())}
             for name, (mine, exact_one) in pairs.items():
@@ -158,14 +167,18 @@ def errors_of(case: Case, directory: Path, truth: h5py.File) -> dict[str, np.nda
     return {name: np.array(values) for name, values in found.items()}
 
 
-def at_points(field: np.ndarray, edge: float, places: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+def at_points(field: np.ndarray, edge: float, places: np.ndarray, width_squared: float = 0.0,
+              highest: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
     """A field (components, z, y, x) on a periodic cube and its gradient, at points of a grid, after a Gaussian filter.
+    A filter of negative `width_squared` undoes one. Modes beyond the wavenumber `highest`, in units of the smallest,
+    are left out.
     """
     cells = field.shape[1]
     number = np.fft.fftfreq(cells, 1 / cells) * (np.abs(np.fft.fftfreq(cells, 1 / cells)) < cells / 2)
     k = 2 * np.pi / edge * number
     squared = k[:, None, None]**2 + k[:, None]**2 + k**2
-    modes = np.fft.fftn(field, axes=(1, 2, 3)) / cells**3 * np.exp(-squared * width**2 / 24)
+    modes = np.fft.fftn(field, axes=(1, 2, 3)) / cells**3 * np.exp(-squared * width_squared / 24)
+    modes *= squared <= (2 * np.pi / edge * (highest + 1e-9)) ** 2
     waves = np.exp(1j * np.multiply.outer(places, k))
 
     def values(of: np.ndarray) -> np.ndarray:
@@ -202,6 +215,46 @@ def fields_of(case: Case, run: Path, seed: int) -> dict[str, float]:
             if comm.rank == 0:
                 found = {name: values.mean() for name, values in errors_of(case, directory, truth).items()}
     return comm.bcast(found)
+
+
+def within_of(case: Case, run: Path, seed: int) -> dict[str, float]:
+    """Compare the error map of a case with the errors (`shares_within`); collective."""
+    comm, found = MPI.COMM_WORLD, None
+    with h5py.File(run / case.tracks / "ground_truth.h5") as truth:
+        filtered, times = truth["fields/filtered"], truth["particles/tracers/position/time"]
+        every = 1 if case.method == "memory" else round(filtered["time"][1] / times[1])
+        rest = (f'[reconstruction]\nmethod = "{case.method}"\ncells = {filtered.attrs["cells"]}\nevery = {every}\n'
+                f'fields = ["velocity", "gradient"]\nsamples = {SAMPLES}\nholdout = 0\n')
+        with made(case, run, seed, rest, ["dns", "reconstruct"]) as directory:
+            if comm.rank == 0:
+                found = shares_within(case, directory, truth)
+    return comm.bcast(found)
+
+
+def shares_within(case: Case, directory: Path, truth: h5py.File) -> dict[str, float]:
+    """Shares of the errors of velocity and gradient at grid points that are within one and two standard deviations of
+    the error map, and the rms of the deviations over that of the errors.
+
+    The true field is the stored one, for tracks of the whole flow with the filter undone, as far as the modes of the
+    reconstruction reach.
+    """
+    reference, filtered = truth["reference"].attrs, truth["fields/filtered"]
+    undone = 0.0 if case.tracks[0] == "f" else -float(reference["filter_width"]) ** 2
+    found: dict[str, list[float]] = defaultdict(list)
+    with h5py.File(directory / "reconstruction.h5") as file:
+        fields, highest = file["fields/reconstructed"], file["about"].attrs["highest_wavenumber"]
+        axis = np.arange(fields.attrs["cells"]) / fields.attrs["cells"] * BOX
+        for time, exact in zip(filtered["time"][()], filtered["velocity"]):
+            frame = int(np.argmin(np.abs(fields["time"][()] - time)))
+            if abs(fields["time"][frame] - time) > 1e-6 or time < float(reference["kolmogorov_time"]):
+                continue
+            for name, true in zip(("velocity", "gradient"), at_points(exact, BOX, axis, undone, highest)):
+                deviation = fields[f"{name}_deviation"][frame]
+                error = np.abs(fields[name][frame] - true.reshape(deviation.shape))
+                for number in (1, 2):
+                    found[f"{name}_within_{number}"].append((error < number * deviation).mean())
+                found[f"{name}_deviation_over_error"].append(np.sqrt((deviation**2).mean() / (error**2).mean()))
+    return {name: float(np.mean(values)) for name, values in found.items()}
 
 
 def forecasts_of(tracks: str, weights: str, run: Path, seed: int) -> dict[str, dict[str, float | None]]:
@@ -261,11 +314,14 @@ def main(name: str, runs: list[Path]) -> None:
         forecasts += [{"tracks": tracks, "method": method} | combined([each[method] for each in found])
                       for method in found[0]]
     learned = [{"tracks": tracks} | combined([learned_of(tracks, run, seed) for seed, run in enumerate(runs)])
-               for tracks in LEARNED[name]]
+               for tracks in LEARNED.get(name, ())]
+    mapped = [case.__dict__ | combined([within_of(case, run, seed) for seed, run in enumerate(runs)])
+              for case in MAPPED.get(name, ())]
+    found = {"fields": fields, "forecasts": forecasts, "learned": learned, "mapped": mapped}
     if MPI.COMM_WORLD.rank == 0:
-        text = json.dumps({"fields": fields, "forecasts": forecasts, "learned": learned}, indent=1) + "\n"
+        text = json.dumps({key: rows for key, rows in found.items() if rows}, indent=1) + "\n"
         (RESULTS / f"tracks-{name}.json").write_text(text, encoding="utf-8")
-        for row in [*fields, *forecasts, *learned]:
+        for row in chain(*found.values()):
             print(row)
 
 

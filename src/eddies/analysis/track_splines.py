@@ -32,6 +32,7 @@ PARABOLA = 1e3              # mu divided by the sixth power of the number of row
 TRIED = 300                 # about the number of tracks from which mu is determined
 BLOCK = 256                 # columns of an influence matrix that are computed at a time
 EQUAL = 1e-6                # fraction of the interval below which times of tracks are the same
+RANDOM = 32                 # sets of random errors that stand for those of tracks with more rows
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,7 @@ class SmoothedTracks:
     smoothing : mu of the splines.
     residual : noise that the residuals of the longest tracks show. It is the given noise if a mu fits it, and the
         estimate if none is given. It is NaN without noise, and for tracks of three rows, which have no residuals.
+    velocity_noise : rms error of a component of the velocity that errors of a coordinate with variance 1 cause.
     """
 
     rows: np.ndarray
@@ -56,6 +58,7 @@ class SmoothedTracks:
     velocity: np.ndarray
     smoothing: float
     residual: float
+    velocity_noise: float
 
 
 def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: float | None,
@@ -77,7 +80,7 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
     steps, within = np.diff(time[order]), np.diff(track[order]) == 0
     if not within.any():
         nothing = np.zeros((0, 3))
-        return SmoothedTracks(np.zeros(0, int), np.zeros(0), np.zeros(0, int), nothing, nothing, NO_NOISE, np.nan)
+        return SmoothedTracks(np.zeros(0, int), np.zeros(0), np.zeros(0, int), nothing, nothing, NO_NOISE, np.nan, 0.0)
     interval = float(np.median(steps[within]))
     ends = np.append(np.flatnonzero(~within) + 1, len(order))
     alike: dict[bytes, list[np.ndarray]] = defaultdict(list)
@@ -92,7 +95,9 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
     smoothing, residual = (NO_NOISE, np.nan) if noise == 0 else _smoothing_of(fits, noise)
     parts = [_sampled(fit, smoothing, rows, time[rows[:, 0]], track[rows[:, 0]], fill)
              for fit, rows in zip(fits, groups)]
-    return SmoothedTracks(*map(np.concatenate, zip(*parts)), smoothing, residual)
+    squares = [fit.tracks * fit.velocity_noise(smoothing) for fit in fits]
+    rows = sum(fit.tracks * len(fit.times) for fit in fits)
+    return SmoothedTracks(*map(np.concatenate, zip(*parts)), smoothing, residual, float(np.sqrt(sum(squares) / rows)))
 
 
 def _sampled(fit: Fit, smoothing: float, rows: np.ndarray, start: np.ndarray, track: np.ndarray,
@@ -168,6 +173,13 @@ class Fit:
             left, freedom = left + np.sum(residuals**2), freedom + np.sum(residuals * columns)
         squares = np.sum((self.spline(smoothing)(self.times) - self._values) ** 2)
         return np.array([squares, 3 * self.tracks * left, 3 * self.tracks * freedom])
+
+    def velocity_noise(self, smoothing: float) -> float:
+        """Return the sum of the variances of a velocity component at all times of a track, for positions with errors of
+        variance 1. Tracks of more than RANDOM rows are tried with RANDOM sets of errors."""
+        count, draw = len(self.times), np.random.default_rng(1)
+        errors = np.eye(count) if count <= RANDOM else draw.choice([-1.0, 1.0], (count, RANDOM)) / np.sqrt(RANDOM)
+        return float(np.sum(self.spline(smoothing, errors).derivative()(self.times) ** 2))
 
     def derivatives(self, smoothing: float, times: np.ndarray) -> Iterator[np.ndarray]:
         """Yield positions, then velocities, of the splines at `times` (m,), each (tracks * m, 3), track after track."""

@@ -16,7 +16,8 @@ ERRORS = {  # column of the table: label, colour, line style
     "velocity_error": ("velocity field", BLUE, "-"),
     "gradient_error": ("velocity gradient", DNS, ":")}
 LEFT_OUT = {  # attribute of the group left_out: words
-    "least-squares": "least squares", "memory": "memory", "kriging": "kriging", "delaunay": "Delaunay interpolation"}
+    "least-squares": "least squares", "memory": "memory", "kriging": "kriging", "delaunay": "Delaunay interpolation",
+    "floor": "noise of their velocities, which is a part of all of these"}
 
 
 def section(about: Mapping[str, float | str], errors: Mapping[str, np.ndarray], of_fields: Mapping[str, np.ndarray],
@@ -52,7 +53,7 @@ def section(about: Mapping[str, float | str], errors: Mapping[str, np.ndarray], 
     shown = Section("reconstruction", "Reconstruction", text, numbers, labels, {
         **{name: "the true field is not known" if name != "validation_error" else "no track was left out"
            for name in ERRORS}, "left_out_memory": "it needs the viscosity",
-        "left_out_delaunay": "the tracks span no volume"})
+        "left_out_delaunay": "the tracks span no volume", "left_out_floor": "no noise was estimated"})
     shown.add_figure("reconstruction", "Reconstructed fields", lambda: overview(both, planes),
                      f"Normalised L2 errors over time{''.join(f', {label}' for label in planes)}"
                      + (" in the plane z = π of the last frame." if planes else "."))

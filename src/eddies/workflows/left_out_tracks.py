@@ -22,7 +22,7 @@ from eddies.workflows.track_source import Source
 log = logging.getLogger("eddies")
 
 MOST_RADIUS = 0.499 * BOX_LENGTH    # of a kernel: a particle must have one image within it
-FRAMES = 10          # most frames that methods with a memory see; errors are those of the second half
+FRAMES = 30          # most frames that methods with a memory see, which gains for 20; errors are of the second half
 LEAST_TRACKS = 2     # smallest number of tracks that are left out
 MOST_TRACKS = 1e5    # largest mean number of tracks that are compared: one rank triangulates all of them
 IMAGES = 2.5         # thickness of the layer of periodic images around a box for the triangulation, in mean spacings
@@ -41,8 +41,9 @@ def errors_at_left_out(scene: Scene, source: Source, file: File, comm: Comm) -> 
     Methods are "least-squares", "memory" if the viscosity is known, "kriging" among neighbours, and "delaunay", linear
     interpolation in the tetrahedra of the tracks that are kept. The error is |v - v_i| / |v'_i| over the left-out
     tracks that lie in a tetrahedron, and the mean over the second half of the first FRAMES frames. `tracks` is their
-    mean number. The result is empty for more than MOST_TRACKS tracks, or if fewer than LEAST_TRACKS are left out.
-    `file` is the ground truth.
+    mean number, and `floor` the error of the true velocity, if splines estimate the noise of the measured ones. The
+    result is empty for more than MOST_TRACKS tracks, or if fewer than LEAST_TRACKS are left out. `file` is the ground
+    truth.
     """
     settings = scene.reconstruction
     frames = range(0, len(source.times), settings.every)[:FRAMES]
@@ -106,9 +107,11 @@ def _errors(scene: Scene, source: Source, methods: tuple[str, ...], found: list[
         inside = inside if inside.any() else ~inside
         exact = apart["velocity"][inside]
         size = np.linalg.norm(exact - exact.mean(0))
+        missed = {name: float(np.linalg.norm(values[inside] - exact)) for name, values in estimates.items()}
+        if source.velocity_noise > 0:
+            missed["floor"] = source.velocity_noise * np.sqrt(exact.size)
         rows.append({"tracks": float(len(exact)), **{
-            name: float(np.linalg.norm(values[inside] - exact) / size) if size > 0 else np.nan
-            for name, values in estimates.items()}})
+            name: float(value / size) if size > 0 else np.nan for name, value in missed.items()}})
     means = {name: float(np.mean([row[name] for row in rows])) for name in (rows[0] if rows else ())}
     return {name: value for name, value in means.items() if np.isfinite(value)}
 

@@ -31,18 +31,21 @@ class Source:
     uniform : whether all measured tracks of a frame have the same velocity.
     filtered : whether the tracks follow a filtered velocity.
     unit : the scene's unit of length, in the unit of the tracks.
+    velocity_noise : rms error of a velocity component, from the noise of positions; 0 for velocities of the file.
     corner : position of the origin of the tracks' coordinates in the cube, in the unit of the tracks.
     """
 
     def __init__(self, tracks: Tracks | None, tracers: Tracers, settings: Reconstruction, file: File,
                  comm: Comm) -> None:
         self._tracks, self.truth, self.spacing, self.uniform = None, None, tracers.spacing, False
+        self.velocity_noise = 0.0
         self.filtered, width = (tracks or tracers).filtered, tracers.filter_width
         if tracks is not None:
             self._tracks = source = TrackFrames(comm, tracks)
             self.times, self.spacing, self.most = source.times, source.spacing, source.most
             self.uniform = source.uniform
             self.unit, self.corner = source.about["length_unit"], source.about["corner"]
+            self.velocity_noise = source.about.get("velocity_noise", 0.0) / self.unit
             tracers = tracers.with_count(count_for(self.spacing))
         resolved = settings.resolving(tracers, self.filtered)
         width = width if self.filtered else NO_FILTER * self.spacing

@@ -106,6 +106,7 @@ def test_noise_of_positions_is_estimated_and_said(tmp_path, caplog, noise):
     written(tmp_path / "a.h5", rows)
     found = read_measured(Tracks(path=str(tmp_path / "a.h5")))
     assert found.about["noise"] == pytest.approx(noise, rel=0.1)
+    assert (found.about["velocity_noise"] > 0) == (noise > 0)
     assert logged(caplog, "noise of a coordinate is about 0.00" if noise else "too small to be estimated")
     written(tmp_path / "a.h5", rows, velocity=True)  # velocities that were measured are taken
     assert "noise" not in read_measured(Tracks(path=str(tmp_path / "a.h5"))).about

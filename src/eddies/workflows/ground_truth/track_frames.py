@@ -190,7 +190,7 @@ def _smoothed(found: Tracks, period: float | None, interval: float, settings: Se
                  if noise else "too small to be estimated")
     elif given > 0 and not 1 / FITTING < splines.residual / given < FITTING:
         log.warning("%s", _noise_misfit(settings, splines.residual))
-    about["noise"] = noise
+    about |= {"noise": noise, "velocity_noise": noise * splines.velocity_noise}
     counts = {"tracks are divided at gaps": begins.sum(), "rows are added in gaps": np.sum(rows < 0),
               "tracks of fewer than three rows are left out": len(np.unique(track)) - len(np.unique(splines.track))}
     for what, count in counts.items():
