@@ -10,10 +10,10 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from paper import save
+from pictures import save
 
 import eddies
-from eddies.report.figures import BAR, SIGNED, colour_bar, panels, show_plane, styled
+from eddies.report.figures import BAR, POSITIVE, SIGNED, colour_bar, panels, show_plane, styled
 
 SCENE = """
 [tracks]
@@ -32,7 +32,6 @@ holdout = 0
 NOISE = 0.02    # standard deviation of a coordinate: a twentieth of the spacing
 FRAMES = 8      # the last ones of the simulation
 SHOWN = 6       # frames of a track that are drawn
-DEVIATION = "Blues"     # few colours are stored, and these are among those of u_x
 THICK = 0.35    # half the thickness of the slice with tracks, about a spacing
 
 
@@ -55,7 +54,7 @@ def reconstructed(truth: Path, folder: Path) -> dict[str, np.ndarray]:
 @styled
 def figure(found: dict[str, np.ndarray]):
     """Tracks in a slice, u_x in its middle, and the standard deviation of u_x."""
-    drawn, axes = panels(1, 3, (3.2, 3.2), right=BAR)
+    drawn, axes = panels(1, 3, (3.6, 2.7), right=BAR)
     place, limit = found["coordinates"], float(np.abs(found["velocity"]).max())
     near = np.flatnonzero(np.abs(place[-1, :, 2] - np.pi) < THICK)
     for row in near:
@@ -65,7 +64,7 @@ def figure(found: dict[str, np.ndarray]):
     dots = axes[0, 0].scatter(*place[-1, near, :2].T, c=found["at_tracks"][-1, near], s=9, cmap=SIGNED, vmin=-limit,
                               vmax=limit, zorder=2)
     planes = {"reconstructed $u_x$": (found["velocity"], (-limit, limit), SIGNED), "standard deviation of its error": (
-        found["velocity_deviation"], (0, float(found["velocity_deviation"].max())), DEVIATION)}
+        found["velocity_deviation"], (0, float(found["velocity_deviation"].max())), POSITIVE)}
     images = [dots] + [show_plane(axis, *plane) for axis, plane in zip(axes[0, 1:], planes.values())]
     axes[0, 0].set(xlim=(0, 2 * np.pi), ylim=(0, 2 * np.pi), aspect=1, xticks=axes[0, 1].get_xticks(),
                    yticks=axes[0, 1].get_yticks(), xticklabels=["0", "π", "2π"], yticklabels=["0", "π", "2π"])
