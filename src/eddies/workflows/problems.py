@@ -80,8 +80,13 @@ def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = 
         for stage in stages:
             needs.append(storage(own, stage, comm.size, measured))
             if on_node * needs[-1].memory > memory:
-                doubts[f"{stage}: {on_node} ranks with about {in_units(needs[-1].memory)} each need more than the "
-                       f"{in_units(memory)} of memory here; take more nodes, or fewer cells or particles"] = []
+                text = (f"{stage}: {on_node} ranks with about {in_units(needs[-1].memory)} each need more than the "
+                        f"{in_units(memory)} of memory here; take more nodes, ")
+                if own.tracks is not None and own.tracks.volume is not None:
+                    refused[f"[tracks] volume: the cube around it is too large in the stage {text}a smaller margin, or "
+                            "fewer tracks"] = None
+                else:
+                    doubts[f"{text}or fewer cells or particles"] = []
     needed = most_disk(needs)
     if scene.sets and scene.kernel is not None and not scene.variant:
         doubts[f"[tracers] set: is absent, so that only the ground truths of {', '.join(scene.sets)} are made; "

@@ -27,6 +27,7 @@ EQUAL = 1e-12     # fraction of a velocity below which velocities are equal
 LEAST_FRAMES = 3
 FITTING = 1.05    # factor by which the noise that tracks show may differ from the given one
 MARGIN = 4.0      # distance between a volume and its periodic image, in mean particle spacings
+FLAT = 0.5        # least thickness of a volume, in mean particle spacings
 
 
 @dataclass(frozen=True)
@@ -306,6 +307,18 @@ def _region(found: Tracks, settings: Settings) -> tuple[np.ndarray, np.ndarray, 
                              f"{'xyz'[int(np.argmin(upper - lower))]} in all rows; give volume as six numbers")
     else:
         lower, upper = np.reshape(settings.volume, (3, 2)).T
-    spacing = (float(np.prod(upper - lower)) / (len(found.time) / len(found.times))) ** (1 / 3)
+    edges, count = upper - lower, len(found.time) / len(found.times)
+    spacing = (float(np.prod(edges)) / count) ** (1 / 3)
+    if edges.min() < FLAT * spacing:
+        raise SceneError(_flat(settings, edges, count))
     margin = MARGIN * spacing if settings.margin is None else settings.margin
-    return lower, upper, float((upper - lower).max()) + margin
+    return lower, upper, float(edges.max()) + margin
+
+
+def _flat(settings: Settings, edges: np.ndarray, count: float) -> str:
+    """Return the refusal of a volume with these `edges` that is too thin for `count` tracks a frame. They then lie in a
+    sheet: no derivative across it can be found, and cells of a cube as small as it is thin are too many."""
+    thickness, axis = edges.min(), int(np.argmin(edges))
+    least = FLAT**1.5 * math.sqrt(float(np.prod(np.delete(edges, axis))) / count)
+    return (f"[tracks] volume: {settings.file}: it is {thickness:.3g} thick along {'xyz'[axis]}, too thin for fields "
+            f"of {count:.0f} tracks a frame; give a volume that is at least {least:.2g} thick, or more tracks")
