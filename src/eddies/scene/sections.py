@@ -144,7 +144,7 @@ class Tracks(Section):
 
     path: str = text("file with the tracks; * stands for any text in the names of a series of tables")
     format: str | None = choice("layout of the file (docs/tracks.md); absent: found from its name and content", "h5md",
-                                "npz", "lagrangebench", "flowtracks", "csv", default=None)
+                                "npz", "lagrangebench", "flowtracks", "proptv", "csv", default=None)
     columns: Columns | None = section(Columns, default=None)
     group: str | None = text("name of the particles or of the trajectory in a file with several", default=None)
     box: float | None = number("edge of the periodic cube; absent: that of the file", default=None, above=0)
