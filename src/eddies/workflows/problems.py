@@ -220,8 +220,8 @@ def directory_problems(stages: Sequence[str], comm: Comm, directory: Path) -> li
 
 
 def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
-    """Yield a problem if a step needs the file of an initial flow or of trained weights that cannot be used, or a
-    device that does not exist. Weights in `made`, the files that the planned steps write, are not read."""
+    """Yield a problem if a step needs the file of an initial flow, of points or of trained weights that cannot be used,
+    or a device that does not exist. Weights in `made`, the files that the planned steps write, are not read."""
     scene, stages = step.scene, step.stages
     initial, weights = scene.initial, scene.model.weights_file if "train" in stages else None
     try:
@@ -230,6 +230,10 @@ def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str
                 pass
         if "dns" in stages and scene.tracks is None and initial.kind == "spectrum":
             given_spectrum(initial, comm)
+        points = scene.reconstruction.points_file if "reconstruct" in stages else None
+        if points is not None:
+            from eddies.io.track_files import read_points  # imports pandas
+            on_first_rank(comm, partial(read_points, points))
         if weights is not None and weights not in made and on_first_rank(comm, weights.is_file):
             read_source(scene.name, ModelDefinition.of(scene), comm)
         if scene.device != "cpu" and {"train", "simulate"} & {*stages}:
