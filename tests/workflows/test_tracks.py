@@ -273,6 +273,7 @@ def test_filtered_tracers_have_the_second_order_of_heun(comm):
 
 @pytest.mark.mpi(1)
 def test_fields_of_tracks_have_the_units_of_the_file(comm, twin, tmp_path, no_figures):
+    (tmp_path / "points.csv").write_text("x;y;z\n0;0;0\n10;0;5\n")
     scene = scene_of(comm, tmp_path, SECTION.format(path=twin / "tracks.csv", unit=MILLISECONDS) + f"""
 viscosity = {0.1 * (MILLIMETRES / (2 * np.pi))**2}
 density = 1000.0
@@ -283,7 +284,6 @@ every = 2
 fields = ["velocity", "acceleration", "pressure", "dissipation"]
 points = "points.csv"
 """)
-    (tmp_path / "points.csv").write_text("x;y;z\n0;0;0\n10;0;5\n")
     assert scene.stages == ("dns", "reconstruct", "report")
     run(scene, output=tmp_path / "run", comm=comm)
     stored = open_run(tmp_path / "run")
