@@ -302,7 +302,7 @@ points = "points.csv"
         assert fields["dissipation"].attrs["share"] == pytest.approx(numbers["dissipation_share"])
         # The rms of the kinematic pressure is about u'^2.
         assert 300 < np.std(fields["pressure"]) / np.mean(fields["velocity"][()]**2) < 3000
-        np.testing.assert_array_equal(own["particles/points/coordinates/value"][0], [[0, 0, 0], [10, 0, 5]])
+        np.testing.assert_allclose(own["particles/points/coordinates/value"][0], [[0, 0, 0], [10, 0, 5]], atol=1e-9)
         acceleration, time = (own[f"fields/reconstructed/{name}"][-2] for name in ("acceleration", "time"))
         tracers, times = true["particles/tracers/velocity/value"], true["particles/tracers/position/time"][()]
         frame = int(np.argmin(np.abs(times - time)))
