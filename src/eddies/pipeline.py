@@ -55,7 +55,7 @@ STAGES = {stage.name: stage for stage in (
     Stage("train-kernel", "the smoothing kernel", ("kernel",), "kernel", ("kernel", "window"),
           ("dns",), "checkpoints-kernel", but=("kernel.form",), shared=True),
     Stage("reconstruct", "velocity, gradient, pressure and acceleration of each frame, from particle tracks",
-          ("reconstruction",), "reconstruction", ("reconstruction",), ("dns", "train-kernel"),
+          ("reconstruction",), "reconstruction", ("reconstruction", "points"), ("dns", "train-kernel"),
           "checkpoints-reconstruct", shared=True),
     Stage("train", "the model of the particles", ("model", "uses_model"), "model",
           ("device", "model", "weights", "training", "truths", "own_model"),

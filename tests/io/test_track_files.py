@@ -65,6 +65,32 @@ def test_arrays_as_published_with_the_paper(tmp_path):
         read_tracks(tmp_path / "a.npz")
 
 
+def test_files_of_the_flows_of_proptv(tmp_path):
+    """The order of the files is that of their times, not of their names."""
+    from scipy.io import netcdf_file
+    draw = np.random.default_rng(1)
+    table, times = draw.random((3, 7, 8)), [0.5, 1.0, 1.5]
+    for name, time, values in zip("cab", times, table):
+        with netcdf_file(tmp_path / f"{name}.nc", "w") as file:
+            file.createDimension("numpart", 7)
+            file.createDimension("partpara", 8)
+            file.createVariable("particles", "d", ("numpart", "partpara"))[:] = values
+            file.createVariable("tprobl", "d", ()).data[...] = time
+    found = read_tracks(tmp_path / "*.nc")
+    z, y, x, w, v, u = np.moveaxis(table[..., :6], -1, 0)
+    assert_same(found, (np.repeat(times, 7), np.tile(np.arange(7), 3), np.stack([x, y, z], -1).reshape(-1, 3),
+                        np.stack([u, v, w], -1).reshape(-1, 3)))
+    assert found.velocity is not None
+    with netcdf_file(tmp_path / "d.nc", "w") as file:
+        file.createDimension("x", 2)
+        file.createVariable("other", "d", ("x",))[:] = 1.0
+    with pytest.raises(ProductError, match="cannot be read as proptv: d.nc holds other, but particles and tprobl are"):
+        read_tracks(tmp_path / "d.nc")
+    (tmp_path / "e.nc").write_bytes(b"\x89HDF of NetCDF-4")
+    with pytest.raises(ProductError, match="cannot be read as proptv: .*not a valid NetCDF 3"):
+        read_tracks(tmp_path / "e.nc")
+
+
 def test_a_trajectory_of_lagrangebench(tmp_path):
     position = np.random.default_rng(1).uniform(0, 1, (4, 9, 3))
     (tmp_path / "metadata.json").write_text(json.dumps({"dt": 0.1, "write_every": 5, "bounds": [[-1, 1]] * 3}))

@@ -9,7 +9,7 @@ import pytest
 
 from eddies.io import track_tables
 from eddies.io.errors import ProductError
-from eddies.io.track_files import read_tracks
+from eddies.io.track_files import read_points, read_tracks
 
 pytestmark = pytest.mark.mpi(1)
 
@@ -223,3 +223,24 @@ def test_a_table_of_numbers_alone_is_not_taken_for_that_of_a_program(tmp_path):
     (tmp_path / "a.txt").write_text(rows(*np.random.default_rng(1).random((11, 4)), mark=" "))
     with pytest.raises(ProductError, match="11 columns without names"):
         read_tracks(tmp_path / "a.txt")
+
+
+@pytest.mark.parametrize("text, times", [
+    ("x;y;z\n1,5;2;3\n4;5;6\n", None), ("1.5 2 3\n4 5 6\n", None),
+    ("Z [mm],time,X [mm],Y [mm]\n3,7,1.5,2\n6,8,4,5\n", [7, 8]),
+    ("trackid,x,y,z,u\na,1.5,2,3,9\nb,4,5,6,9\n", None)])
+def test_points_are_read_without_tracks(tmp_path, text, times):
+    (tmp_path / "points.csv").write_text(text)
+    time, position = read_points(tmp_path / "points.csv")
+    np.testing.assert_array_equal(position, [[1.5, 2, 3], [4, 5, 6]])
+    assert time is None if times is None else time.tolist() == times
+
+
+@pytest.mark.parametrize("text, words", [
+    ("", "no column x"), ("x,y,c\n1,2,3\n", "it has no column z; name"),
+    ("frame,x,y,z\n1,1,2,3\n", "numbers of frames"),
+    ("x,y,z\n1,2,3\n1,nan,3\n", "row 2 has no number in the column of y")])
+def test_points_that_lack_something_are_refused(tmp_path, text, words):
+    (tmp_path / "points.csv").write_text(text)
+    with pytest.raises(ProductError, match=words):
+        read_points(tmp_path / "points.csv")

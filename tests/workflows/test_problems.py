@@ -172,6 +172,35 @@ def test_the_pressure_and_the_acceleration_depend_on_what_lies_beyond_a_volume(c
     assert lines("velocity") == lines("acceleration", "box = 1.0") == []
 
 
+@pytest.mark.mpi(1, 2)
+def test_a_volume_whose_cube_does_not_fit_is_refused(comm, tmp_path):
+    """Tracks in a slab need the cells of the cube around it."""
+    folder, draw = comm.bcast(tmp_path), np.random.default_rng(1)
+    position = np.tile(draw.uniform(0.1, 0.9, (300, 3)) * [1, 1, 0.2], (3, 1))
+    position += np.repeat([0, 0.01, 0.02], 300)[:, None]
+    if comm.rank == 0:
+        write_tracks(folder / "a.h5", np.repeat([0, 1, 2], 300), np.tile(np.arange(300), 3), position)
+        scene_file(folder, '[tracks]\npath = "a.h5"\nvolume = [0, 1, 0, 1, 0, 0.2]\n')
+    comm.Barrier()
+    scene = with_tracks(load_scene(folder / "case.toml"), comm)
+    planned, needed = steps(scene, ["dns"], folder), comm.size * storage(scene, "dns", comm.size).memory
+    assert problems(scene, planned, comm, 1.1 * needed) == ([], [])
+    (line,), _ = problems(scene, planned, comm, 0.9 * needed)
+    assert line.startswith("[tracks] volume: the cube around it is too large in the stage dns") and "margin" in line
+
+
+@pytest.mark.mpi(1)
+def test_a_table_of_points_is_read_before_the_run(comm, tmp_path):
+    scene = load_scene(TINY, ["reconstruction.method=least-squares", f"reconstruction.points={tmp_path / 'p.csv'}"])
+    for text, words in ((None, "p.csv: cannot be read: No such file"), ("x,y\n1,2,3\n", "cannot be read as a table")):
+        if text:
+            (tmp_path / "p.csv").write_text(text)
+        (line,), _ = problems_of(scene, comm)
+        assert words in line and "\n" not in line
+    (tmp_path / "p.csv").write_text("x,y,z\n1,2,3\n")
+    assert not problems_of(scene, comm)[0]
+
+
 @pytest.mark.mpi(1)
 def test_a_warning_names_the_variants_that_it_concerns(comm):
     scene = load_scene("tiny", ["variant.paper.simulation.step=0.3", "variant.no-force.simulation.step=0.3",

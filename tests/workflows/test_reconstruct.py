@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from eddies.analysis.linear_flow import LinearFlow
+from eddies.errors import UserError
 from eddies.io import new_files
 from eddies.io.errors import WriteError
 from eddies.parallel.slab import SlabDecomposition
@@ -40,13 +42,15 @@ def test_quantities_of_a_taylor_green_vortex_are_exact(comm):
     field = np.stack([np.sin(x) * np.cos(y), -np.cos(x) * np.sin(y), 0 * z])
     mean, unit, viscosity = np.array([0.5, 0.0, -1.0]), 3.0, 0.1
     modes = grid.with_mean(grid.to_modes(torch.from_numpy(field)), torch.from_numpy(mean))
-    made = reconstruct.Quantities(modes, torch.ones_like(grid.shell), viscosity, grid, tuple(RECONSTRUCTED), unit)
+    made = reconstruct.Quantities(modes, grid, tuple(RECONSTRUCTED), reconstruct.Medium(
+        torch.ones_like(grid.shell), viscosity, unit))
     for name, values in exact_of(*points(target.decomposition), mean, unit, viscosity).items():
         np.testing.assert_allclose(made.on(target)[name], values, atol=1e-12, err_msg=name)
     # The filter acts on the velocity with k^2 = 2 and on its pressure with k = 2.
     width = 1.2
     transfer = grid.filter_transfer(width)
-    filtered = reconstruct.Quantities(transfer * modes, transfer, viscosity, grid, ("pressure",), unit)
+    filtered = reconstruct.Quantities(transfer * modes, grid, ("pressure",),
+                                      reconstruct.Medium(transfer, viscosity, unit))
     exact = exact_of(*points(target.decomposition), mean, unit, viscosity)["pressure"]
     np.testing.assert_allclose(filtered.on(target)["pressure"], np.exp(-(2 * width) ** 2 / 24) * exact, atol=1e-12)
     slab = grid.decomposition
@@ -73,6 +77,113 @@ def exact_of(x, y, z, mean, unit, viscosity):
             "pressure": unit**2 * (np.cos(2 * x) + np.cos(2 * y))[None] / 4,
             "acceleration": unit * np.stack([sx * cx - 2 * viscosity * sx * cy, sy * cy + 2 * viscosity * cx * sy,
                                              zero])}
+
+
+@pytest.mark.mpi(1, 2)
+def test_quantities_beside_a_mean_flow_are_exact(comm):
+    """u = T (0, cos x, 0) is the filtered u* with T = exp(-s^2 / 2), in W = V + (e x' + S y', -e y', 0), where x' is
+    counted from the centre. W.grad u* has the component -e x' sin x, whose filtered value is -e T (x' sin x +
+    s^2 cos x). So the filter gives the acceleration e s^2 T cos x, and the pressure p of 2 S d_x u_y is -2 S T sin x.
+    """
+    grid = FourierGrid(SlabDecomposition(comm, 2 * np.pi, 16), 5, 1)
+    target = SpectralGrid(SlabDecomposition(comm, 2 * np.pi, 12), cutoff=5)
+    slope, variance, viscosity, unit = np.array([[0.5, 2.0, 0], [0, -0.5, 0], [0, 0, 0]]), 0.1, 0.1, 3.0
+    (e, shear), damped = slope[0, :2], np.exp(-0.1 / 2)
+    mean, drift = LinearFlow(np.full(3, np.pi), np.array([20.0, 0, 1.0]), slope), np.array([0.0, 0.5, 0.0])
+    transfer = grid.filter_transfer(np.sqrt(12 * variance))
+    wave = np.cos(np.broadcast_to(grid.spectral.coordinates()[0], grid.spectral.physical_shape))
+    modes = transfer * grid.to_modes(torch.from_numpy(np.stack([0 * wave, wave, 0 * wave])))
+    made = reconstruct.Quantities(grid.with_mean(modes, torch.from_numpy(drift)), grid, tuple(RECONSTRUCTED),
+                                  reconstruct.Medium(transfer, viscosity, unit, mean)).on(target)
+    x, y, z = np.broadcast_arrays(*target.coordinates())
+    whole = LinearFlow(mean.center, mean.velocity + drift, slope)
+    velocity, pressure, acceleration = (make(x, y, z) for make in (whole.at, whole.pressure, whole.acceleration))
+    velocity[1] += damped * np.cos(x)
+    pressure -= 2 * shear * damped * np.sin(x)
+    acceleration[0] += 2 * shear * damped * np.cos(x)
+    acceleration[1] += (e * variance - viscosity) * damped * np.cos(x)
+    turning = -damped * np.sin(x)  # du_y / dx
+    for name, values in {"velocity": unit * velocity, "pressure": unit**2 * pressure,
+                         "acceleration": unit * acceleration}.items():
+        np.testing.assert_allclose(made[name], values, atol=1e-10, err_msg=name)
+    np.testing.assert_allclose(made["gradient"][3], turning, atol=1e-12)
+    np.testing.assert_allclose(made["gradient"][[0, 1]], np.broadcast_to(slope[0, :2, None, None, None], (2, *x.shape)),
+                               atol=1e-12)
+    np.testing.assert_allclose(made["vorticity"][2], turning - shear, atol=1e-12)
+    np.testing.assert_allclose(made["dissipation"][0], unit**2 * 2 * viscosity * (
+        2 * e**2 + (shear + turning) ** 2 / 2), atol=1e-10)
+    np.testing.assert_allclose(made["q"][0], -e**2 - shear * turning, atol=1e-10)
+
+
+@pytest.mark.mpi(1)
+def test_a_pressure_has_the_density_and_a_dissipation_what_the_modes_lack(comm):
+    """The share that the modes lack is that of their own strain, not of the mean flow."""
+    grid = FourierGrid(SlabDecomposition(comm, 2 * np.pi, 12), 4, 1)
+    target = SpectralGrid(grid.decomposition, cutoff=5)
+    x, y, z = np.broadcast_arrays(*target.coordinates())
+    modes = grid.to_modes(torch.from_numpy(np.stack([np.sin(x) * np.cos(y), -np.cos(x) * np.sin(y), 0 * z])))
+    shear = LinearFlow(np.full(3, np.pi), np.zeros(3), np.array([[0.0, 3.0, 0], [0, 0, 0], [0, 0, 0]]))
+    medium = reconstruct.Medium(torch.ones_like(grid.shell), 0.1)
+
+    def made(name, **changes):
+        return reconstruct.Quantities(modes, grid, (name,), replace(medium, **changes)).on(target)[name]
+
+    np.testing.assert_allclose(made("pressure", density=1000.0), 1000 * made("pressure"), rtol=1e-12)
+    own = made("dissipation")
+    np.testing.assert_allclose(made("dissipation", share=0.4), own / 0.4, rtol=1e-10)
+    np.testing.assert_allclose(made("dissipation", share=0.4, background=shear) - own / 0.4,
+                               made("dissipation", background=shear) - own, atol=1e-12)
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("timed", [False, True])
+def test_quantities_at_given_points_are_those_of_the_field(comm, flow, tmp_path, linked, timed):
+    """Points of the grid, and their periodic images; with times each is in the nearest frame."""
+    (scene, folder), draw, edge = flow, np.random.default_rng(5), 2 * np.pi
+    linked(folder)
+    with h5py.File(folder / "ground_truth.h5") as file:
+        times = file["particles/tracers/position/time"][::3]
+    index, frame = draw.integers(0, 20, (30, 3)), draw.integers(0, len(times), 30)
+    place = edge / 20 * index + edge * draw.integers(-1, 2, (30, 3))
+    if comm.rank == 0:
+        columns = np.column_stack([times[frame] + 0.01, place]) if timed else place
+        np.savetxt(tmp_path / "points.csv", columns, delimiter=",", header="time,x,y,z" if timed else "x,y,z",
+                   comments="")
+    settings = Reconstruction(every=3, fields=("velocity", "q"), points=str(tmp_path / "points.csv"), holdout=0.0,
+                              samples=2)
+    comm.Barrier()
+    reconstruct.run(replace(scene, reconstruction=settings), comm, tmp_path)
+    with h5py.File(tmp_path / "reconstruction.h5") as file:
+        table = {name: file[f"particles/points/{name}/value"][()] for name in (
+            "row", "coordinates", "velocity", "velocity_deviation", "q")}
+        field = {name: values[()] for name, values in file["fields/reconstructed"].items()}
+    assert len(table["row"]) == len(times)
+    for number in range(len(times)):
+        rows = np.flatnonzero(frame == number) if timed else np.arange(30)
+        there = slice(len(rows))
+        np.testing.assert_array_equal(table["row"][number], [*rows, *[-1] * (table["row"].shape[1] - len(rows))])
+        np.testing.assert_allclose(table["coordinates"][number, there], place[rows] % edge, atol=1e-9)
+        for name, error in (("velocity", 0.01), ("velocity_deviation", 0.1), ("q", 0.05)):
+            x, y, z = index[rows].T
+            exact = field[name][number][:, z, y, x].T
+            # Cubic splines on the grid of the modes, with 7/3 points in the shortest wave.
+            assert np.abs(table[name][number, there] - exact).max() <= error * np.abs(field[name][number]).max()
+
+
+@pytest.mark.mpi(2)
+@pytest.mark.parametrize("text, words", [
+    (None, "points.csv: cannot be read: No such file"), ("x,y\n1,2,3\n", "points.csv: cannot be read as a table of"),
+    ("time,x,y,z\n0,1,1,1\n99,1,2,3\n", r"points.csv: .1, 2, 3, 99. is outside .* times from 0 to 0.*1 such")])
+def test_points_that_cannot_be_used_are_refused_on_all_ranks(comm, flow, tmp_path, linked, text, words):
+    scene, folder = flow
+    linked(folder)
+    if comm.rank == 0 and text:
+        (tmp_path / "points.csv").write_text(text)
+    comm.Barrier()
+    settings = Reconstruction(every=3, fields=("velocity",), points=str(tmp_path / "points.csv"), holdout=0.0)
+    with pytest.raises(UserError, match=words) as caught:
+        reconstruct.run(replace(scene, reconstruction=settings), comm, tmp_path)
+    assert "\n" not in str(caught.value) and not (tmp_path / "reconstruction.h5").exists()
 
 
 @pytest.fixture(scope="session")

@@ -273,13 +273,16 @@ def test_filtered_tracers_have_the_second_order_of_heun(comm):
 
 @pytest.mark.mpi(1)
 def test_fields_of_tracks_have_the_units_of_the_file(comm, twin, tmp_path, no_figures):
+    (tmp_path / "points.csv").write_text("x;y;z\n0;0;0\n10;0;5\n")
     scene = scene_of(comm, tmp_path, SECTION.format(path=twin / "tracks.csv", unit=MILLISECONDS) + f"""
 viscosity = {0.1 * (MILLIMETRES / (2 * np.pi))**2}
+density = 1000.0
 [reconstruction]
 method = "memory"
 cells = 14
 every = 2
-fields = ["velocity", "acceleration"]
+fields = ["velocity", "acceleration", "pressure", "dissipation"]
+points = "points.csv"
 """)
     assert scene.stages == ("dns", "reconstruct", "report")
     run(scene, output=tmp_path / "run", comm=comm)
@@ -294,6 +297,12 @@ fields = ["velocity", "acceleration"]
         time = own["fields/reconstructed/time"][-1]
         frame = int(np.argmin(np.abs(true["fields/filtered/time"][()] - time)))
         assert relative(field, true["fields/filtered/velocity"][frame] * MILLIMETRES / (2 * np.pi)) < 0.15
+        fields = own["fields/reconstructed"]
+        assert fields["pressure"].attrs["units"].decode() == "M/(L T^2)"
+        assert fields["dissipation"].attrs["share"] == pytest.approx(numbers["dissipation_share"])
+        # The rms of the kinematic pressure is about u'^2.
+        assert 300 < np.std(fields["pressure"]) / np.mean(fields["velocity"][()]**2) < 3000
+        np.testing.assert_allclose(own["particles/points/coordinates/value"][0], [[0, 0, 0], [10, 0, 5]], atol=1e-9)
         acceleration, time = (own[f"fields/reconstructed/{name}"][-2] for name in ("acceleration", "time"))
         tracers, times = true["particles/tracers/velocity/value"], true["particles/tracers/position/time"][()]
         frame = int(np.argmin(np.abs(times - time)))
@@ -365,6 +374,101 @@ def test_eight_tracks_in_a_box_have_fields(comm, tmp_path, no_figures, method):
                                  'fields = ["velocity"]\n'), output=tmp_path / "run", comm=comm)
     with h5py.File(tmp_path / "run/reconstruction.h5") as file:
         assert 0 < np.abs(file["fields/reconstructed/velocity"][()]).max() < 3  # velocities are at most 1
+
+
+class RandomFlow:
+    """A solenoidal velocity of random waves; the rms of a component is about one."""
+
+    def __init__(self, seed):
+        draw = np.random.default_rng(seed)
+        directions = draw.standard_normal((60, 3))
+        self.waves = directions / np.linalg.norm(directions, axis=1)[:, None] * draw.uniform(1, 4, (60, 1))
+        across = np.cross(self.waves, draw.standard_normal((60, 3)))
+        self.speeds = across / np.linalg.norm(across, axis=1)[:, None] * np.sqrt(6 / 60)
+        self.phases = draw.uniform(0, 2 * np.pi, 60)
+
+    def at(self, position):
+        return np.cos(position @ self.waves.T + self.phases) @ self.speeds
+
+    def gradient(self, position):
+        return np.einsum("nw,wi,wj->nij", -np.sin(position @ self.waves.T + self.phases), self.speeds, self.waves)
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_mean_flow_and_shear_change_no_error(comm, tmp_path, no_figures):
+    """Tracks in a volume of turbulence, with and without a wind of 20 u' and a shear of 20 u' from face to face."""
+    flow, slope = RandomFlow(1), np.array([[1.0, 5.0, 0.0], [0.5, -1.5, 2.0], [0.0, 1.0, 0.5]])
+    middle, wind, count = np.array([3.0, 2.0, 2.0]), np.array([20.0, 1.0, 0.0]), 400
+    start, errors, fields = middle + np.random.default_rng(2).uniform(-2, 2, (count, 3)), [], []
+    times = 1e-6 * np.arange(3)  # so short that all have the same positions
+    for moves in (0, 1):
+        velocity = flow.at(start) + moves * (wind + (start - middle) @ slope.T)
+        if comm.rank == 0:
+            write_tracks(tmp_path / "a.h5", np.repeat(times, count), np.tile(np.arange(count), 3),
+                         np.concatenate([start + time * velocity for time in times]), np.tile(velocity, (3, 1)))
+        comm.Barrier()
+        folder = tmp_path / str(moves)
+        run(scene_of(comm, tmp_path, """[tracks]
+path = "a.h5"
+volume = [0.99, 5.01, -0.01, 4.01, -0.01, 4.01]
+background = "linear"
+[reconstruction]
+fields = ["velocity", "gradient"]
+cells = 24
+every = 3
+particles = true
+holdout = 0.0
+"""), output=folder, comm=comm)
+        with h5py.File(folder / "reconstruction.h5") as file, h5py.File(folder / "ground_truth.h5") as truth:
+            about, tracks_of = dict(file["about"].attrs), dict(truth["tracks"].attrs)
+            made = {key: file[f"fields/reconstructed/{key}"][0].astype(float) for key in ("velocity", "gradient")}
+            found = [file["particles/tracks/velocity/value"][0],
+                     truth["particles/tracers/velocity/value"][0] * about["length_unit"]]
+        points = 2 * np.pi * about["length_unit"] / 24 * np.arange(24) - about["corner"][:, None]
+        place = np.stack(np.meshgrid(*points, indexing="ij"), -1).T  # (3, z, y, x)
+        inner = (np.abs(place - middle[:, None, None, None]) < 1.2).all(0)
+        place = place[:, inner].T
+        mean, turbulent, slopes = (moves * (wind + (place - middle) @ slope.T), flow.at(place), flow.gradient(place))
+        fields.append(made["velocity"][:, inner].T - mean)
+        errors.append([
+            relative(fields[-1], turbulent), relative(made["gradient"][:, inner].T - (moves * slope).ravel(),
+                                                      slopes.reshape(-1, 9)),
+            np.linalg.norm(found[0] - velocity) / np.linalg.norm(flow.at(start)), tracks_of["validation_error"]])
+        np.testing.assert_allclose(found[1], velocity, atol=1e-5)  # the ground truth has the background too
+        # The mean of the turbulence over the volume, and its slope, are a part of the background.
+        assert np.abs(tracks_of["background_velocity"] - moves * wind).max() < 0.5
+        assert np.abs(tracks_of["background_gradient"] - moves * slope).max() < 0.5
+    # Displacements and the rounding of stored fields change the tracks by 1e-5.
+    np.testing.assert_allclose(errors[1], errors[0], rtol=1e-2)
+    assert relative(fields[1], fields[0]) < 1e-3
+    assert errors[0][0] < 0.3 and errors[0][2] < 0.1
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("keys, words", [
+    ("box = 7.0", "background = .linear.: a periodic box has no mean shear"),
+    ('volume = "auto"\nviscosity = 0.1\n[reconstruction]\nmethod = "memory"',
+     "background = .linear.: forecasts of the method .memory. have no mean shear")])
+def test_a_background_without_a_volume_or_with_a_memory_is_refused(comm, tmp_path, keys, words):
+    with pytest.raises(SceneError, match=words):
+        tracks.with_tracks(scene_of(comm, tmp_path, '[tracks]\npath = "a.h5"\nbackground = "linear"\n' + keys), comm)
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("thickness, volume, fits", [(2e-5, "[0, 1, 0, 1, 0, 2e-5]", False), (2e-5, '"auto"', False),
+                                                     (0.018, "[0, 1, 0, 1, 0, 0.018]", True)])
+def test_a_volume_thinner_than_half_a_spacing_is_refused(comm, tmp_path, thickness, volume, fits):
+    """400 tracks in a sheet are 0.05 apart. A volume of 0.018 has a mean spacing of 0.036."""
+    if comm.rank == 0:
+        start = np.random.default_rng(1).random((400, 3)) * [1, 1, thickness]
+        write_tracks(tmp_path / "flat.h5", np.repeat([0.0, 1.0, 2.0], 400), np.tile(np.arange(400), 3),
+                     np.tile(start, (3, 1)), np.random.default_rng(2).standard_normal((1200, 3)) * 1e-16, edge=2.0)
+    scene = scene_of(comm, tmp_path, f'[tracks]\npath = "flat.h5"\nvolume = {volume}\n')
+    if fits:
+        assert tracks.with_tracks(scene, comm).tracers.spacing < 0.036 * 2 * np.pi
+        return
+    with pytest.raises(SceneError, match="volume: .*flat.h5: it is .*e-05 thick along z, .* least 0.018 thick"):
+        tracks.with_tracks(scene, comm)
 
 
 @pytest.mark.mpi(1)

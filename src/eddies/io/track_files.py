@@ -1,4 +1,4 @@
-"""Particle tracks of experiments and other programs, read in five layouts and written in the first of them.
+"""Particle tracks of experiments and other programs, read in six layouts and written in the first of them.
 
 A track is the path of one particle. Tracks are kept as rows, one for each particle and time, sorted by time. Layouts:
 
@@ -9,6 +9,8 @@ A track is the path of one particle. Tracks are kept as rows, one for each parti
 - "lagrangebench": TRAJECTORY/position (frames, particles, 3) and metadata.json beside the file (Toshev et al. 2023).
 - "flowtracks": rows with `trajid`, `time`, `pos` and `vel` or `velocity`, in the group or table /trajectories or
   /particles.
+- "proptv": NetCDF-3 files, one for each frame, as the flows from which proPTV makes its test data: `particles`
+  (particles, 8) holds z, y, x, w, v, u, temperature and pressure, and `tprobl` the time.
 - "csv": a table, or a series of tables, as tracking programs write them (io/track_tables.py).
 """
 
@@ -30,11 +32,11 @@ import numpy as np
 from eddies.io.errors import ProductError, read_errors
 from eddies.io.file_patterns import matching_files
 from eddies.io.new_files import create_export
-from eddies.io.track_tables import is_table, read_table
+from eddies.io.track_tables import is_table, read_point_table, read_table
 from eddies.io.trajectories import ROUNDING, write_h5md_header
 
-SUFFIXES = {".npz": "npz", **dict.fromkeys((".csv", ".txt", ".dat", ".tsv"), "csv")}
-TIMED = ("h5md", "lagrangebench")       # layouts whose frames have times
+SUFFIXES = {".npz": "npz", ".nc": "proptv", **dict.fromkeys((".csv", ".txt", ".dat", ".tsv"), "csv")}
+TIMED = ("h5md", "lagrangebench", "proptv")   # layouts whose frames have times
 METADATA = "metadata.json"              # file beside those of LagrangeBench
 ROWS = ("trajectories", "particles")    # groups or tables of flowtracks
 FILL = -1  # the id of a row without a particle
@@ -110,18 +112,33 @@ def read_tracks(path: str | Path, layout: str | None = None, group: str | None =
                 raise ProductError(f"{path}: layout = {layout!r}: must be one of {', '.join(LAYOUTS)}")
             if layout == "csv":
                 found = Tracks(*read_table(path, columns, frame_rate))
-            elif len(files) > 1:
+            elif len(files) > 1 and layout != "proptv":
                 raise ProductError(f"{path}: names {len(files)} files, but only tables may be several; give one file")
             elif columns:
                 raise ProductError(f"{path}: has the layout {layout}; columns is for tables only, remove it")
             elif frame_rate is not None and layout in TIMED:
                 raise ProductError(f"{path}: has the layout {layout}, whose frames have times; remove frame_rate")
+            elif layout == "proptv":
+                found = _read_proptv(files)
             else:
                 found = READERS[layout](files[0], group, frame_rate)
     except UNREADABLE as error:
         text = " ".join(str(error.args[0] if error.args else error).split())
         raise ProductError(f"{path}: cannot be read as {layout}: {text}") from None
     return checked(found, path)
+
+
+def read_points(path: Path) -> tuple[np.ndarray | None, np.ndarray]:
+    """Read the points of a table with the columns x, y, z and, if it has times, `time`.
+
+    Returns time (rows,) or None, and position (rows, 3). Raises ProductError if the file is missing or has no such
+    rows.
+    """
+    try:
+        with read_errors(path):
+            return read_point_table(path)
+    except UNREADABLE as error:
+        raise ProductError(f"{path}: cannot be read as a table of points: {' '.join(str(error).split())}") from None
 
 
 def write_tracks(path: str | Path, times: Any, ids: Any, positions: Any, velocities: Any = None,
@@ -262,9 +279,23 @@ def _read_flowtracks(path: Path, group: str | None, frame_rate: float | None) ->
     return found if frame_rate is None else replace(found, time=found.time / frame_rate)
 
 
+def _read_proptv(files: Sequence[Path]) -> Tracks:
+    from scipy.io import netcdf_file  # here, because the import is slow
+    times, frames = [], []
+    for path in files:
+        with netcdf_file(path, mmap=False) as file:
+            if not {"particles", "tprobl"} <= {*file.variables}:
+                raise ValueError(f"{path.name} holds {', '.join(file.variables) or 'nothing'}, but particles and "
+                                 "tprobl are needed")
+            times.append(float(file.variables["tprobl"].getValue()))
+            frames.append(np.array(file.variables["particles"].data, float))
+    table = np.stack([frames[number] for number in np.argsort(times)])
+    return _from_frames(np.sort(times), table[..., 2::-1], table[..., 5:2:-1])
+
+
 READERS: Mapping[str, Callable[[Path, str | None, float | None], Tracks]] = {
     "h5md": _read_h5md, "npz": _read_npz, "lagrangebench": _read_lagrangebench, "flowtracks": _read_flowtracks}
-LAYOUTS = (*READERS, "csv")  # tables, which may be several files, are read by `read_table`
+LAYOUTS = (*READERS, "proptv", "csv")  # the last two may be several files
 # Errors that numpy, h5py and json raise for a file whose content does not fit the layout.
 UNREADABLE = (KeyError, ValueError, TypeError, IndexError, AttributeError, EOFError, BadZipFile, zlib.error)
 

@@ -199,6 +199,23 @@ def read_table(path: Path, columns: Mapping[str, str | int] | None = None, frame
     return time[kept], track[kept], position[kept], None if velocity is None else velocity[kept]
 
 
+def read_point_table(path: Path) -> tuple[np.ndarray | None, np.ndarray]:
+    """Read the points of a table: time (rows,), or None if no column has this name, and position (rows, 3).
+
+    A table without names has the columns x, y, z. Raises ValueError as `read_table` does, and for a table without rows.
+    """
+    heading = heading_of(path)
+    given = {} if heading.names else {name: place for place, name in enumerate(POINT, 1)}
+    places = _places(heading, given, needed=()) if heading.rows else {}
+    for name in POINT:
+        if name not in places:
+            raise ValueError(f"it has no column {name}; name the columns {', '.join(POINT)} in the first line")
+    if "frame" in places:
+        raise ValueError("it has numbers of frames; give the column time, counted from the first frame, in their place")
+    columns, _ = _read(path, heading, {name: places[name] for name in ("time", *POINT) if name in places}, {})
+    return columns.get("time"), np.stack([columns[name] for name in POINT], axis=1)
+
+
 @dataclass
 class _Part:
     """The rows of one file.
@@ -231,8 +248,9 @@ class _Part:
         which new ones are added."""
         heading = heading_of(file)
         program = None if given else next((each for each in PROGRAMS if _fits(each, heading)), None)
+        timed = number is not None or heading.zones  # whether it needs no times
         places = ({name: place for place, name in enumerate(program.columns) if name} if program
-                  else _places(heading, given, timed=number is not None or heading.zones)
+                  else _places(heading, given, [name for name in NEEDED if not (timed and name == "time")])
                   if heading.rows or heading.names else {})
         if not heading.rows:
             return cls({"x": np.zeros(0)}, number, [])
@@ -297,8 +315,8 @@ def _fits(program: Program, heading: Heading) -> bool:
                     for place in whole))
 
 
-def _places(heading: Heading, given: Mapping[str, str | int], timed: bool) -> dict[str, int]:
-    """Return the place of each column that is read, by NAMES. `timed` says whether the table needs no times.
+def _places(heading: Heading, given: Mapping[str, str | int], needed: Sequence[str]) -> dict[str, int]:
+    """Return the place of each column that is read, by NAMES; those of `needed` must be there, or a frame for the time.
 
     Raises ValueError if a column is missing or is there twice.
     """
@@ -320,9 +338,9 @@ def _places(heading: Heading, given: Mapping[str, str | int], timed: bool) -> di
         found[name] = _given_place(name, column, names, width)
     if "time" in found:
         found.pop("frame", None)
-    for name in NEEDED:
-        if name not in found and not (name == "time" and (timed or "frame" in found)):
-            raise ValueError(f"the first line must name the columns {', '.join(NEEDED)}, but it names "
+    for name in needed:
+        if name not in found and not (name == "time" and "frame" in found):
+            raise ValueError(f"the first line must name the columns {', '.join(needed)}, but it names "
                              f"{', '.join(names)}; add or correct {name}, or say by columns which one it is" if names
                              else f"{width} columns without names, but tracks need {', '.join(NEEDED)}; give the "
                              "numbers of these columns, such as columns = {track = 1, time = 2, x = 3, y = 4, z = 5}")

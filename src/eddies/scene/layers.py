@@ -23,8 +23,8 @@ from eddies.scene.values import SceneError
 BUILT_IN = Path(__file__).parents[1] / "scenes"
 VARIANT = "variant"
 FILE_ONLY_KEYS = ("base", "unset")  # keys that only a file may have
-FILE_KEYS = {"initial": ("path",), "tracks": ("path",), "model": ("path",), "training": ("truths",),
-             "simulation": ("step_from", "confirmed_on")}
+FILE_KEYS = {"initial": ("path",), "tracks": ("path",), "reconstruction": ("points",),
+             "model": ("path",), "training": ("truths",), "simulation": ("step_from", "confirmed_on")}
 OF_VARIANTS = ("model", "training", "simulation", "eulerian")  # sections that only the variants of a scene use, if any
 DEEPEST = 3  # largest number of parts of a key, as in section.sub.key; [variant.NAME] adds two
 

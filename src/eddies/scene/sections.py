@@ -144,7 +144,7 @@ class Tracks(Section):
 
     path: str = text("file with the tracks; * stands for any text in the names of a series of tables")
     format: str | None = choice("layout of the file (docs/tracks.md); absent: found from its name and content", "h5md",
-                                "npz", "lagrangebench", "flowtracks", "csv", default=None)
+                                "npz", "lagrangebench", "flowtracks", "proptv", "csv", default=None)
     columns: Columns | None = section(Columns, default=None)
     group: str | None = text("name of the particles or of the trajectory in a file with several", default=None)
     box: float | None = number("edge of the periodic cube; absent: that of the file", default=None, above=0)
@@ -153,6 +153,9 @@ class Tracks(Section):
                                                      words=("auto",))
     margin: float | None = number("distance between the volume and its image in the periodic cube around it; absent: "
                                   "four mean spacings", default=None, above=0)
+    background: str = choice("mean flow of a volume, which is fitted to all tracks and taken out before fields are "
+                             "reconstructed; linear: a velocity and a shear, both constant", "none", "linear",
+                             default="none")
     time_unit: float = number("factor from times of the file to the time unit of its velocities", default=1.0, above=0)
     frame_rate: float | None = number("frames per unit of time, for files that count frames or have no times",
                                       default=None, above=0)
@@ -163,6 +166,8 @@ class Tracks(Section):
     viscosity: float | None = number("kinematic viscosity, for terms that need it", default=None, above=0)
     sound_speed: float | None = number("speed of sound, for terms that need the density; the file must have densities",
                                        default=None, above=0)
+    density: float | None = number("constant density of the fluid, by which reconstructed pressures are multiplied; "
+                                   "absent: they are divided by it", default=None, above=0)
     noise: float | str | None = number("standard deviation of the error of a measured coordinate; auto: estimated; "
                                        "absent: estimated if the file has no velocities, else 0", default=None,
                                        words=("auto",), at_least=0)
@@ -176,6 +181,9 @@ class Tracks(Section):
             if self.margin is not None:
                 raise self.problem("margin", "this key belongs to volume, which is missing; remove it, or give volume "
                                    "in place of box")
+            if self.background != "none":
+                raise self.problem("background", "a periodic box has no mean shear, and its mean velocity needs no "
+                                   "key; remove background, or give volume in place of box")
             return
         if not isinstance(self.volume, str) and (len(self.volume) != 6 or not all(
                 low < high for low, high in zip(self.volume[::2], self.volume[1::2]))):
@@ -405,6 +413,10 @@ class Reconstruction(Section):
                                     "symmetric part, xx, yy, zz, xy, xz, yz; q, r: its invariants",
                                     *RECONSTRUCTED, default=("velocity", "vorticity", "pressure"))
     particles: bool = boolean("whether the quantities are stored at the particles too", default=False)
+    points: str | None = text("table of points, with columns x, y, z and perhaps time, at which they are stored too",
+                              default=None)
+    correct_dissipation: bool = boolean("whether the part of the dissipation is added that the modes lack, by the "
+                                        "spectrum of turbulence", default=False)
     holdout: float = number("share of the tracks that a second reconstruction leaves out, to estimate the error; 0: "
                             "none", default=0.1, at_least=0, at_most=0.5)
     memory: float = number("time for which a wave is remembered, in units of 1 / (k u')", default=4.0, above=0)
@@ -425,6 +437,11 @@ class Reconstruction(Section):
     def deviations(self) -> tuple[str, ...]:
         """The quantities whose standard deviations are stored."""
         return tuple(name for name in self.fields if name in LINEAR) if self.samples else ()
+
+    @property
+    def points_file(self) -> Path | None:
+        """The table of points."""
+        return None if self.points is None else expanded(self.points)
 
     @property
     def of_neighbors(self) -> bool:

@@ -92,7 +92,6 @@ def _errors(scene: Scene, source: Source, methods: tuple[str, ...], found: list[
     """Return the errors of all methods. `found` has the results of `_by_modes` for each of `methods`."""
     slab = SlabDecomposition(alone, BOX_LENGTH, source.slab.planes)
     form = Form("kriging", kernel_of(scene.tracers), scene.tracers.filter_width)
-    periodic = scene.tracks is None or scene.tracks.volume is None
     rows: list[dict[str, float]] = []
     for each in zip(*found):
         known, apart = each[0]
@@ -102,7 +101,7 @@ def _errors(scene: Scene, source: Source, methods: tuple[str, ...], found: list[
         estimates = {name: rows_of["estimate"] for name, (_, rows_of) in zip(methods, each)}
         estimates["kriging"] = as_numpy(form.at(ParticleField(slab, form.support, **given),
                                                 torch.from_numpy(apart["position"]))[0])
-        estimates["delaunay"] = interpolated(known, apart["position"], source.spacing if periodic else 0.0)
+        estimates["delaunay"] = interpolated(known, apart["position"], source.spacing if source.periodic else 0.0)
         inside = np.isfinite(estimates["delaunay"]).all(1)
         inside = inside if inside.any() else ~inside
         exact = apart["velocity"][inside]

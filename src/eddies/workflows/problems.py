@@ -80,8 +80,13 @@ def problems(scene: Scene, planned: Sequence[Step], comm: Comm, memory: float = 
         for stage in stages:
             needs.append(storage(own, stage, comm.size, measured))
             if on_node * needs[-1].memory > memory:
-                doubts[f"{stage}: {on_node} ranks with about {in_units(needs[-1].memory)} each need more than the "
-                       f"{in_units(memory)} of memory here; take more nodes, or fewer cells or particles"] = []
+                text = (f"{stage}: {on_node} ranks with about {in_units(needs[-1].memory)} each need more than the "
+                        f"{in_units(memory)} of memory here; take more nodes, ")
+                if own.tracks is not None and own.tracks.volume is not None:
+                    refused[f"[tracks] volume: the cube around it is too large in the stage {text}a smaller margin, or "
+                            "fewer tracks"] = None
+                else:
+                    doubts[f"{text}or fewer cells or particles"] = []
     needed = most_disk(needs)
     if scene.sets and scene.kernel is not None and not scene.variant:
         doubts[f"[tracers] set: is absent, so that only the ground truths of {', '.join(scene.sets)} are made; "
@@ -215,8 +220,8 @@ def directory_problems(stages: Sequence[str], comm: Comm, directory: Path) -> li
 
 
 def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
-    """Yield a problem if a step needs the file of an initial flow or of trained weights that cannot be used, or a
-    device that does not exist. Weights in `made`, the files that the planned steps write, are not read."""
+    """Yield a problem if a step needs the file of an initial flow, of points or of trained weights that cannot be used,
+    or a device that does not exist. Weights in `made`, the files that the planned steps write, are not read."""
     scene, stages = step.scene, step.stages
     initial, weights = scene.initial, scene.model.weights_file if "train" in stages else None
     try:
@@ -225,6 +230,10 @@ def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str
                 pass
         if "dns" in stages and scene.tracks is None and initial.kind == "spectrum":
             given_spectrum(initial, comm)
+        points = scene.reconstruction.points_file if "reconstruct" in stages else None
+        if points is not None:
+            from eddies.io.track_files import read_points  # imports pandas
+            on_first_rank(comm, partial(read_points, points))
         if weights is not None and weights not in made and on_first_rank(comm, weights.is_file):
             read_source(scene.name, ModelDefinition.of(scene), comm)
         if scene.device != "cpu" and {"train", "simulate"} & {*stages}:

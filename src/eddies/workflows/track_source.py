@@ -1,19 +1,65 @@
 """The particles of each frame, from measured tracks or a ground truth, and the solver that fits them."""
 
+from __future__ import annotations
+
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from eddies.io.hdf5 import File, read_attributes
+from eddies.analysis.linear_flow import LinearFlow
+from eddies.io.hdf5 import File, in_files, read_attributes
+from eddies.io.track_files import read_points
 from eddies.parallel.communicator import Comm
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
-from eddies.scene.scene import Reconstruction, Tracers, Tracks
+from eddies.scene.scene import BOX_LENGTH, Reconstruction, SceneError, Tracers, Tracks
 from eddies.workflows.ground_truth.track_frames import TrackFrames, count_for
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.track_solver import NO_FILTER, best_solver, particles_on, slabs_for, solver_of
+
+NEAREST = 0.500001  # largest distance in time between a point and its frame, in frame intervals
+
+
+class GivenPoints:
+    """The points of [reconstruction] points in the frames with these `times`. The constructor is collective.
+
+    A point with a time is in the frame that is nearest in time, a point without one in all frames.
+
+    Attributes
+    ----------
+    most : largest number of points in a frame.
+
+    Raises ProductError if the file cannot be read, SceneError if a point is outside the cube, or if its time is outside
+    the frames.
+    """
+
+    def __init__(self, source: Source, path: Path, times: np.ndarray) -> None:
+        self._slab = source.slab
+        time, position = in_files(self._slab.comm, path, lambda: read_points(path))
+        self._position, self._frames = (position + source.corner) / source.unit, None
+        bad = np.zeros(len(position), bool)
+        if not source.periodic:
+            bad = ((self._position < 0) | (self._position >= BOX_LENGTH)).any(1)
+        if time is not None:
+            self._frames = np.abs(times - time[:, None]).argmin(1)
+            bad |= np.abs(times[self._frames] - time) > NEAREST * np.diff(times).max(initial=0.0)
+        if bad.any():
+            row = int(np.argmax(bad))
+            place, when = ", ".join(f"{x:.4g}" for x in position[row]), "" if time is None else f", {time[row]:g}"
+            raise SceneError(f"[reconstruction] points: {path}: ({place}{when}) is outside the cube around the volume, "
+                             f"or the times from 0 to {times[-1]:g} ({bad.sum()} such points); remove it")
+        self.most = len(position) if self._frames is None else int(np.bincount(self._frames).max())
+
+    def at(self, number: int) -> ParticleSet:
+        """Return this rank's points in frame `number` of `times`, as particles at rest; the id is the row of the file,
+        from 0 on. Collective."""
+        rows = np.arange(len(self._position)) if self._frames is None else np.flatnonzero(self._frames == number)
+        rows = rows[self._slab.rank::self._slab.size]
+        place = self._position[rows] % BOX_LENGTH
+        return particles_on(self._slab, {"id": rows, "position": place, "velocity": np.zeros_like(place)})
 
 
 class Source:
@@ -28,7 +74,9 @@ class Source:
     slab : this rank's part of the box, with the planes of the grid of the modes.
     most : largest number of particles in a frame.
     truth : the ground truth with true fields; None for measured tracks.
+    periodic : whether the cube is a period of the flow, and no volume lies in it.
     uniform : whether all measured tracks of a frame have the same velocity.
+    background : the mean flow beside which the particles' velocities are; None without one.
     filtered : whether the tracks follow a filtered velocity.
     unit : the scene's unit of length, in the unit of the tracks.
     velocity_noise : rms error of a velocity component, from the noise of positions; 0 for velocities of the file.
@@ -39,11 +87,13 @@ class Source:
                  comm: Comm) -> None:
         self._tracks, self.truth, self.spacing, self.uniform = None, None, tracers.spacing, False
         self.velocity_noise = 0.0
+        self.background: LinearFlow | None = None
+        self.periodic = tracks is None or tracks.volume is None
         self.filtered, width = (tracks or tracers).filtered, tracers.filter_width
         if tracks is not None:
             self._tracks = source = TrackFrames(comm, tracks)
             self.times, self.spacing, self.most = source.times, source.spacing, source.most
-            self.uniform = source.uniform
+            self.uniform, self.background = source.uniform, source.background
             self.unit, self.corner = source.about["length_unit"], source.about["corner"]
             self.velocity_noise = source.about.get("velocity_noise", 0.0) / self.unit
             tracers = tracers.with_count(count_for(self.spacing))

@@ -87,6 +87,9 @@ def _unfit(scene: Scene) -> Iterator[str]:
         if settings.volume is not None and wanted.of_neighbors:
             yield (f'[reconstruction] method = "{wanted.method}": its points need particles on all sides, which a '
                    'volume that is not periodic lacks; set method = "least-squares" or "memory"')
+        if settings.background != "none" and wanted.method == "memory":
+            yield (f'[tracks] background = "{settings.background}": forecasts of the method "memory" have no mean '
+                   'shear; set [reconstruction] method = "least-squares", or remove background')
     if learned and not settings.filtered and settings.sound_speed is not None:
         yield (f"[tracks] sound_speed = {settings.sound_speed:g}: the density of the unfiltered flow is no filtered "
                f"density, which models need; remove sound_speed, or {', '.join(learned)}")
@@ -170,7 +173,7 @@ def write_frames(file: File, flows: FittedFlows, tracks: TrackFrames, tracers: T
     this rank in the first two frames of FilteredTracers, the statistics of the flow in each stored frame, and the
     columns `time`, `energy` and `filtered` of its spectra. Raises Stopped if `stop` requests it.
     """
-    comm, times, complete = tracks.comm, tracks.times, tracks.complete
+    comm, times, complete, mean = tracks.comm, tracks.times, tracks.complete, tracks.background
     coarse = SpectralGrid(SlabDecomposition(comm, BOX_LENGTH, tracers.cells), cutoff=(tracers.cells - 1) // 2)
     traced = FilteredTracers(flows.slab, tracks.frame(0)) if follows else None
     count = traced.total if traced else complete
@@ -189,12 +192,16 @@ def write_frames(file: File, flows: FittedFlows, tracks: TrackFrames, tracers: T
             paths += [columns] if frame < 2 else []
         else:
             start, columns = id_block(comm, complete)[0], tracks.frame(frame, complete=True)
+            if mean is not None:
+                columns["velocity"] = columns["velocity"] + mean.at(*columns["position"].T).T
         if trajectory:
             trajectory.append(frame, time, start, columns)
         if not stored:
             continue
         grid, modes = flow.grid.spectral, as_numpy(flow.filtered)
-        fields.append(time, coarse.decomposition.start, {"velocity": coarse.backward(regrid(grid, coarse, modes))})
+        field = coarse.backward(regrid(grid, coarse, modes))
+        fields.append(time, coarse.decomposition.start, {
+            "velocity": field if mean is None else field + mean.at(*coarse.coordinates())})
         row = flow.scales(viscosity) | {"time": time, "energy": flow.energy.sum()}
         skewness, flatness = gradient_moments(grid, modes)
         rows.append(row | {"skewness": skewness, "flatness": flatness} | component_energies(grid, modes))

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from eddies.analysis.linear_flow import LinearFlow
 from eddies.analysis.track_splines import NO_NOISE, smooth
 from eddies.clock import SAME
 from eddies.io.file_patterns import FileVersion, file_versions
@@ -27,6 +28,7 @@ EQUAL = 1e-12     # fraction of a velocity below which velocities are equal
 LEAST_FRAMES = 3
 FITTING = 1.05    # factor by which the noise that tracks show may differ from the given one
 MARGIN = 4.0      # distance between a volume and its periodic image, in mean particle spacings
+FLAT = 0.5        # least thickness of a volume, in mean particle spacings
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,8 @@ class MeasuredTracks:
     times : times of the frames, from 0 on, (frames,).
     starts : first row of each frame, and at the end the number of rows, (frames + 1,).
     columns : `id` (rows,), `position` and `velocity` (rows, 3). With [tracks] sound_speed also `density` (rows,), in
-        units of its mean.
+        units of its mean. Velocities are those beside the `background`.
+    background : the mean flow of [tracks] background = "linear"; None without it.
     uniform : whether all tracks of a frame have the same velocity, in each frame.
     throughout : whether the track of a row is present in all frames, (rows,).
     spacing : mean particle spacing, the cube root of (volume with particles / mean number of rows of a frame).
@@ -51,6 +54,7 @@ class MeasuredTracks:
     times: np.ndarray
     starts: np.ndarray
     columns: Mapping[str, np.ndarray]
+    background: LinearFlow | None
     uniform: bool
     throughout: np.ndarray
     spacing: float
@@ -88,10 +92,10 @@ class TrackFrames:
 
     def __init__(self, comm: Comm, settings: Settings) -> None:
         self.comm = comm
-        self.times, self.about, self.mean_count, self.complete, self.spacing, self.uniform, self.most = in_files(
-            comm, settings.file, lambda: (
-                (found := read_measured(settings)).times, found.about, found.mean_count, found.complete, found.spacing,
-                found.uniform, int(np.diff(found.starts).max())))
+        (self.times, self.about, self.mean_count, self.complete, self.spacing, self.background, self.uniform,
+         self.most) = in_files(comm, settings.file, lambda: (
+             (found := read_measured(settings)).times, found.about, found.mean_count, found.complete, found.spacing,
+             found.background, found.uniform, int(np.diff(found.starts).max())))
         self._tracks = read_measured(settings) if comm.rank == 0 else None
 
     def frame(self, number: int, complete: bool = False) -> dict[str, np.ndarray]:
@@ -155,12 +159,20 @@ def _read_measured(settings: Settings, versions: tuple[FileVersion, ...]) -> Mea
                "velocity": found.velocity / unit}
     if settings.sound_speed is not None:
         columns["density"] = found.density / found.density.mean()
+    background = None
+    if settings.background == "linear":
+        background = LinearFlow.fitted(columns["position"], columns["velocity"], np.full(3, BOX_LENGTH / 2))
+        columns["velocity"] = columns["velocity"] - background.at(*columns["position"].T).T
+        about |= {"background_velocity": background.velocity * unit, "background_gradient": background.gradient}
+        log.info("%s: in the middle of the volume the mean velocity is (%s), and the largest component of its gradient "
+                 "is %.3g", settings.file, ", ".join(f"{x:.3g}" for x in about["background_velocity"]),
+                 np.abs(background.gradient).max())
     spacing = (float(np.prod(upper - lower)) / (len(found.time) / len(times))) ** (1 / 3) / unit
     uniform = _uniform(columns["velocity"], found.starts, times[1])
     if uniform:
-        log.warning("%s: all tracks move alike: the velocity field is uniform, and there are no errors relative to "
-                    "its fluctuation", settings.file)
-    return MeasuredTracks(times, found.starts, columns, uniform, (counts == len(times))[place], spacing,
+        log.warning("%s: all tracks move alike%s: the velocity field is uniform, and there are no errors relative to "
+                    "its fluctuation", settings.file, "" if background is None else " beside the background")
+    return MeasuredTracks(times, found.starts, columns, background, uniform, (counts == len(times))[place], spacing,
                           about | {"length_unit": unit, "corner": corner})
 
 
@@ -306,6 +318,18 @@ def _region(found: Tracks, settings: Settings) -> tuple[np.ndarray, np.ndarray, 
                              f"{'xyz'[int(np.argmin(upper - lower))]} in all rows; give volume as six numbers")
     else:
         lower, upper = np.reshape(settings.volume, (3, 2)).T
-    spacing = (float(np.prod(upper - lower)) / (len(found.time) / len(found.times))) ** (1 / 3)
+    edges, count = upper - lower, len(found.time) / len(found.times)
+    spacing = (float(np.prod(edges)) / count) ** (1 / 3)
+    if edges.min() < FLAT * spacing:
+        raise SceneError(_flat(settings, edges, count))
     margin = MARGIN * spacing if settings.margin is None else settings.margin
-    return lower, upper, float((upper - lower).max()) + margin
+    return lower, upper, float(edges.max()) + margin
+
+
+def _flat(settings: Settings, edges: np.ndarray, count: float) -> str:
+    """Return the refusal of a volume with these `edges` that is too thin for `count` tracks a frame. They then lie in a
+    sheet: no derivative across it can be found, and cells of a cube as small as it is thin are too many."""
+    thickness, axis = edges.min(), int(np.argmin(edges))
+    least = FLAT**1.5 * math.sqrt(float(np.prod(np.delete(edges, axis))) / count)
+    return (f"[tracks] volume: {settings.file}: it is {thickness:.3g} thick along {'xyz'[axis]}, too thin for fields "
+            f"of {count:.0f} tracks a frame; give a volume that is at least {least:.2g} thick, or more tracks")

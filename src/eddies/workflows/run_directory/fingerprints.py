@@ -28,6 +28,7 @@ def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> 
     settings: dict[str, Any] = asdict(scene) | {
         "window": scene.window, "start": _digest(scene.tracks.file if scene.tracks else scene.initial.file),
         "weights": _digest(scene.model.weights_file if scene.model else None),
+        "points": _digest(scene.reconstruction.points_file if scene.reconstruction else None),
         "truths": _fingerprints(training.truth_files if training else ()),
         "found_step": _digest(simulation.step_file if simulation else None),
         "confirming": _fingerprints(simulation.confirming_files if simulation else ())}
@@ -37,7 +38,8 @@ def stage_fingerprint(scene: Scene, stage: str, without: Sequence[str] = ()) -> 
             "sets": {name: {key: sets[name][key] for key in SET_KEYS} for name in sorted(sets)}}
     # The content of these files counts, not their paths.
     for content, section, key in (("start", "tracks" if scene.tracks else "initial", "path"),
-                                  ("weights", "model", "path"), ("found_step", "simulation", "step_from")):
+                                  ("weights", "model", "path"), ("points", "reconstruction", "points"),
+                                  ("found_step", "simulation", "step_from")):
         if settings[content] is not None:
             del settings[section][key]
     if simulation is not None:
