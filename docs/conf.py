@@ -22,10 +22,9 @@ myst_fence_as_directive = ["math"]
 myst_heading_anchors = 3
 napoleon_use_ivar = True
 
-# Notebooks are kept without what they show; `-D nb_execution_mode=force` runs them, for a site with their figures.
+# Notebooks are kept with what they show: docs/run_notebooks.py.
 nb_execution_mode = "off"
-nb_execution_in_temp = nb_execution_raise_on_error = nb_merge_streams = True
-nb_execution_timeout = 600
+nb_merge_streams = True
 
 # Formulas are MathML, which browsers render without a script from elsewhere.
 html_math_renderer = "mathml"

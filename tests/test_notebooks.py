@@ -1,7 +1,13 @@
-"""The notebooks of the documentation run from first to last cell, on smaller scenes, and find what they claim."""
+"""The notebooks of the documentation run from first to last cell, on smaller scenes, and find what they claim.
+
+What their cells show is stored with them (docs/run_notebooks.py), from the scenes as they are. The smaller scenes show
+the same words and pictures; their numbers differ.
+"""
 
 import base64
+import importlib.util
 import json
+import re
 from pathlib import Path
 
 import nbformat
@@ -14,6 +20,10 @@ from eddies.analysis.pareto import pareto_front
 from mpi_tools.launch import mpi_environment
 
 NOTEBOOKS = Path(__file__).parents[1] / "docs" / "notebooks"
+_found = importlib.util.spec_from_file_location("run_notebooks", NOTEBOOKS.parent / "run_notebooks.py")
+_module = importlib.util.module_from_spec(_found)
+_found.loader.exec_module(_module)
+shown = _module.shown  # the outputs of a cell that are stored
 SMALLER = ["flow.cells=16", "spin_up.turnovers=0.2", "tracers.particles_per_side=8", "tracers.field_cells=12",
            "tracers.turnovers=0.3", "kernel.neighbors=30", "kernel.steps=4", "kernel.points=50"]
 NO_SEARCH = "simulation.step=0.1"
@@ -57,10 +67,11 @@ def kernel(folder):
 
 @pytest.fixture
 def execute(folder, kernel):
-    """A function that runs a notebook, whose reports have no figures `but` these. It returns the cells by id, and the
-    value of an expression at the end."""
+    """A function that runs a notebook, whose reports have no figures `but` these, and compares its outputs with those
+    that are stored. It returns the cells by id, and the value of an expression at the end."""
     def run(name, expression, but=(), **parameters):
         notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+        stored = {cell.id: words(cell.outputs) for cell in notebook.cells if cell.cell_type == "code"}
         (place,) = [number for number, cell in enumerate(notebook.cells)
                     if "parameters" in cell.metadata.get("tags", ())]
         given = "\n".join(f"{key} = {value!r}" for key, value in parameters.items())
@@ -69,9 +80,19 @@ def execute(folder, kernel):
         client = NotebookClient(notebook, kernel, timeout=600, resources={"metadata": {"path": str(folder)}})
         client.execute()
         client.kc.stop_channels()
+        for cell in notebook.cells:
+            if cell.id in stored and "of-the-machine" not in cell.metadata.get("tags", ()):
+                assert words(shown(cell)) == stored[cell.id], f"{name}, {cell.id}: docs/run_notebooks.py {name}"
         return {cell.id: cell for cell in notebook.cells}, json.loads(notebook.cells[-1].outputs[0].text)
 
     return run
+
+
+def words(outputs):
+    """The kind of each output, and its text with # in place of one or several numbers."""
+    texts = [output.get("text") or output["data"].get("text/plain", "a picture") for output in outputs]
+    return [re.sub(r"#( (\.\.\. )?#)*", "#", " ".join(re.sub(r"[-+]?\d[\w.,:+-]*|\bNaN\b", " # ", text).split()))
+            for text in texts]
 
 
 def figures(cells):
@@ -80,13 +101,16 @@ def figures(cells):
             for output in cell.get("outputs", ()) if "image/png" in output.get("data", {})}
 
 
-def test_notebooks_are_kept_without_output():
+def test_notebooks_are_kept_with_small_outputs_but_for_logs():
     for path in NOTEBOOKS.glob("*.ipynb"):
         notebook = nbformat.read(path, as_version=4)
         nbformat.validate(notebook)
         code = [cell for cell in notebook.cells if cell.cell_type == "code"]
-        assert all(not cell.outputs and cell.execution_count is None for cell in code), path
+        assert any("image/png" in output.get("data", {}) for cell in code for output in cell.outputs), path
+        assert all(cell.execution_count is None for cell in code), path
+        assert not any(cell.outputs for cell in code if "hide-output" in cell.metadata.get("tags", ())), path
         assert set(notebook.metadata) == {"kernelspec", "language_info"}, path
+    assert sum(path.stat().st_size for path in NOTEBOOKS.glob("*.ipynb")) < 600_000
 
 
 def test_a_first_run(execute, folder):
