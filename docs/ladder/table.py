@@ -31,7 +31,7 @@ RESULTS, FIGURE = HERE.parent / "results", HERE.parent / "paper" / "ladder.png"
 CHOICE = "realisation-2"
 #: The rungs that the line of the figure connects, and those whose names stand beside their points.
 LINE = "paper", "wide", "together", "local", "resolved"
-NAMED = *LINE, "horizons-8", "no-density"
+NAMED = *LINE, "horizons-8", "to-resolved", "no-density"
 FRAMES = 6  # of the timing
 #: Measures by their names in the table of the page; the others are stored alone.
 SHOWN = {"acceleration_error": "a priori", "velocity_error_half": "T/2", "velocity_error_end": "T",

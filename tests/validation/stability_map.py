@@ -249,7 +249,10 @@ def main(ladder: Path, chosen: list[str]) -> None:
     for axis, case, name, compute in cases(ladder, chosen):
         results = found.setdefault(axis, {}).setdefault(case, {})
         if name not in results:
-            results[name] = compute()
+            try:
+                results[name] = compute()
+            except ValueError:  # the radius is above half the box
+                results[name] = {"broken": 0.0, "cause": "does not fit"}
             known.write_text(json.dumps(found))  # a stopped script goes on here
             print(f"{axis}: {case}: {name}: {results[name]}", flush=True)
     (OUTPUT / "stability-map.json").write_text(json.dumps(found, indent=1) + "\n")
