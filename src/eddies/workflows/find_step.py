@@ -278,7 +278,8 @@ def integrators(scene: Scene, scales: ReferenceScales, span: float) -> Iterator[
         longest = span if scheme.dense else settings.frame_interval
         if terms:
             allowed = allowed_by_terms(terms, ModelDefinition.of(scene).units(scales), scheme, scales.velocity)
-            longest /= 2 ** max(math.ceil(math.log2(longest / allowed) - 1e-9), 0)
+            while longest > allowed * (1 + ROUND_OFF):
+                longest /= 2
         yield name, longest, scheme.evaluations
 
 
