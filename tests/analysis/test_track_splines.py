@@ -25,9 +25,9 @@ def error(found, true):
 
 @pytest.mark.parametrize("frames, smoothing", [(3, 1.0), (200, 10.0)])
 def test_the_noise_of_velocities_is_that_of_splines_of_noise(frames, smoothing):
-    """Three rows give a parabola: the velocity at its ends has the variance 26/4, in its middle 1/2, over h^2. For long
-    tracks the sum is a mean of 32 draws of 200 numbers, with an error of 2 %; that of 2000 draws is better, but for
-    three rows, where it has 2 % too."""
+    """Three rows give a parabola: the velocity at its ends has the variance 26/4, in its middle 1/2, over h^2. For
+    long tracks 32 sets of random errors give the sum to 2 %. The test has 2000 sets, which are more exact; for three
+    rows they give the sum to 2 % too."""
     time = INTERVAL * np.arange(frames)
     fit = Fit(time, np.zeros((1, frames, 3)), INTERVAL)
     found = fit.velocity_noise(smoothing) * INTERVAL**2

@@ -72,3 +72,18 @@ def test_few_particles_tell_more_over_several_frames(comm):
         errors.append(np.sqrt(comm.allreduce(float(missed.sum())) / 3))
     assert errors[0] > 0.3
     assert errors[-1] < 0.5 * errors[0]
+
+
+@pytest.mark.mpi(1)
+def test_flows_follow_their_forecasts_five_times_longer_than_the_estimate_counts(comm):
+    """With k dt = 1 and a memory C = 2 beta is exp(-u'/4), and gamma is beta^(1/5)."""
+    flow, still = remembered(comm, memory=2.0), np.zeros(3)
+    slab = flow.solver.grid.decomposition
+    first = flow.of(particles_of(comm, slab, 500, 0.0, 2, still), 0.0)
+    flow.of(particles_of(comm, slab, 500, 0.5, 2, still), 0.5)
+    nothing = torch.zeros_like(first)
+    forgotten = -flow.deviation(first, nothing)                     # beta F(u)
+    followed = flow.deviation(nothing, nothing) + forgotten         # gamma F(u)
+    speed = np.sqrt(float((flow.solver.grid.multiplicity * first.abs().square().sum(0)).sum()) / 3)
+    # Errors of the estimate have other wavenumbers, with a few per cent of its energy.
+    assert float(followed.abs().norm() / forgotten.abs().norm()) == pytest.approx(np.exp(0.8 * speed / 4), rel=5e-3)
