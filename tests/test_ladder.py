@@ -58,3 +58,22 @@ def test_the_force_is_that_of_the_sixty_nearest(comm):
         changed[order[place]] += 1.0
         after = rates_of(*alone(position, changed, density), model)["acceleration"][0]
         assert torch.equal(after, before) == same
+
+
+@pytest.mark.mpi(1, 2)
+def test_noise_of_the_training_belongs_to_the_particle(comm):
+    """It does not depend on the ranks, is drawn anew at each evaluation, and vanishes without gradients."""
+    columns, model, same = state(COUNT), rung(comm, "noise"), rung(comm, "noise")
+
+    def accelerations(placed, noisy):
+        slab, particles = placed
+        found = dynamics_of(slab, noisy, iterations=ITERATIONS).rates(particles).acceleration.detach()
+        return by_id(slab.comm, particles, found, COUNT)
+
+    first, second = (accelerations(distributed(comm, *columns), model) for _ in range(2))
+    assert_close(first, accelerations(alone(*columns), same), 1e-11)
+    with torch.no_grad():
+        exact = accelerations(alone(*columns), same)
+    # Two draws differ by sqrt(2) times what one adds: 0.05 u' / (d / 2 u') in the force alone.
+    least = 0.05 * 2 * SCALES.velocity ** 2 / SCALES.filter_width
+    assert (first - exact).std() > least / 2 and (second - first).std() > least / 2

@@ -6,6 +6,7 @@ package knows them.
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 
 import eddies
@@ -168,16 +169,24 @@ class NoisySettings(declared.PairNetwork):
 class NoisyForce(PairNetwork):
     """The learned force, trained with noise in its velocities that it has to take back (Sanchez-Gonzalez et al. 2020).
 
-    While gradients are recorded, each velocity has noise n, and the force is compared with a_true - n/tau.
+    While gradients are recorded, each velocity has noise n, and the force is compared with a_true - n/tau. The noise
+    depends on the seed, the number of the evaluation and the id of the particle, so a ghost has that of its original.
     """
 
     Settings = NoisySettings
+
+    def __init__(self, settings, flow) -> None:
+        super().__init__(settings, flow)
+        self.seed, self.evaluations = flow.seed, 0
 
     def forward(self, context) -> eddies.Rates:
         settings, particles, scales = self.settings, context.particles, context.flow.scales
         if not torch.is_grad_enabled():
             return super().forward(context)
-        noise = settings.noise * scales.velocity * torch.randn_like(particles.velocity)
+        self.evaluations += 1
+        random = np.random.default_rng([self.seed, self.evaluations])
+        drawn = torch.as_tensor(random.standard_normal((int(particles.id.max()) + 1, 3)))[particles.id]
+        noise = settings.noise * scales.velocity * drawn.to(particles.velocity)
         noisy = Context(context.decomposition, replace(particles, velocity=particles.velocity + noise), context.flow,
                         context.local, None, context.rows, context.dtype, context.density)
         rates = super().forward(noisy)
