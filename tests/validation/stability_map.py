@@ -9,6 +9,7 @@ and stability-map.png to the folder docs/validation.
 """
 
 import argparse
+import itertools
 import json
 import math
 import re
@@ -43,7 +44,8 @@ SCHEME, USUAL, MOST_STEPS = "corrected-verlet", 0.3, 20_000  # the usual step, i
 STEPS = (0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
 SPEEDS = {0.01: 195.0, 0.04: 48.8, 0.08: 24.4, 0.16: 12.2, 0.5: 3.9}  # by Mach number
 SIDES = (56, 32, 16, 12, 7)  # particles per side; the filter is two spacings wide
-NEIGHBORS = (8, 20, 150, 300)
+NEIGHBORS = (8, 20, 60, 150, 300)
+UNFIT = "does not fit"  # the radius of the neighbourhood is above half the box
 ELSEWHERE = {"paper": "hit-256-paper", "local": "hit-256-local", "resolved": "hit-256"}
 State, Outcome = dict[str, np.ndarray], dict[str, float | str]
 
@@ -173,18 +175,18 @@ def cases(ladder: Path, chosen: list[str]) -> Iterator[tuple[str, str, str, Call
         for name, (own, weights) in variants.items():
             usual = partial(outcome, own, weights, flow)
             for step in STEPS:
-                yield "step / t_η", f"{step:g}", name, partial(usual, step=step)
+                yield "step", f"{step:g} t_η", name, partial(usual, step=step)
             for words, position in arrangements(flow).items():
                 yield "start", words, name, partial(usual, flow.at(position))
             for words, density in (("10 % higher", 1.1 * begin["density"]), ("its mean", 0 * begin["density"] + 1)):
-                yield "density at the start", words, name, partial(usual, begin | {"density": density})
-            yield "boost", "30 u′", name, partial(usual, frame=drift)
+                yield "density", words, name, partial(usual, begin | {"density": density})
+            yield "boost of", "30 u′", name, partial(usual, frame=drift)
             double = replace(own, simulation=replace(own.simulation, precision="float64"))
             yield "precision", "double", name, partial(outcome, double, weights, flow)
-            yield ("precision", "weights of half precision", name,
+            yield ("precision", "half, of the weights", name,
                    lambda: outcome(own, rounded(weights, RUNS / "half.h5"), flow))
             if name in ELSEWHERE:
-                yield ("weights of another flow", ELSEWHERE[name], name,
+                yield ("weights", "of hit-256", name,
                        partial(outcome, own, WEIGHTS / f"{ELSEWHERE[name]}.h5", flow))
     for axis, case, *change in ([("M_t", f"{mach:g}", f"flow.sound_speed={speed}") for mach, speed in SPEEDS.items()]
                                 + [("filter", f"{side}³ particles", f"tracers.particles_per_side={side}")
@@ -200,7 +202,7 @@ def cases(ladder: Path, chosen: list[str]) -> Iterator[tuple[str, str, str, Call
     for name, (own, _) in variants.items():
         if "pairs" in own.model.reads:
             for number in NEIGHBORS:
-                yield "neighbours, trained", str(number), name, partial(with_neighbors, own, name, number, base)
+                yield "neighbours", str(number), name, partial(with_neighbors, own, name, number, base)
 
 
 def with_neighbors(own: Scene, name: str, number: int, base: Path) -> Outcome:
@@ -216,29 +218,37 @@ def with_neighbors(own: Scene, name: str, number: int, base: Path) -> Outcome:
 
 
 @styled
-def figure(found: dict[str, dict[str, dict[str, dict]]], names: list[str]):
-    """One row a case, one column a variant: the error at T/2 as a colour and a number, or time and cause of the end."""
+def figure(found: dict[str, dict[str, dict[str, Outcome]]], names: list[str]):
+    """One row a case, one column a variant: the error at T/2 as a colour and a number, or time and cause of the end.
+
+    Black: the rollout breaks off. Grey: the neighbourhood does not fit into the box. White: no such case.
+    """
     rows = [(axis, case) for axis, each in found.items() for case in each]
-    drawn, axes = panels(1, 1, (1.4 * len(names) + 3, 0.2 * len(rows) + 0.6))
+    drawn, axes = panels(1, 1, (8.3, 0.21 * len(rows) + 0.8))
+    drawn.subplots_adjust(left=0.31, right=0.98, bottom=0.1, top=0.95)
     axis, values = axes[0, 0], np.full((len(rows), len(names)), np.nan)
-    for row, (kind, case) in enumerate(rows):
-        for column, name in enumerate(names):
-            result = found[kind][case].get(name)
-            if result is None:
-                continue
-            broken = "broken" in result
-            values[row, column] = np.nan if broken else min(result["error"], 1.0)
-            text = f"{result['broken']:.2f} T: {result['cause']}" if broken else f"{result['error']:.2f}"
-            axis.text(column, row, text, ha="center", va="center", fontsize=7,
-                      color="white" if broken or values[row, column] > 0.55 else "black")
-            if broken:
-                axis.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, color="black", linewidth=0))
+    for (row, (kind, case)), (column, name) in itertools.product(enumerate(rows), enumerate(names)):
+        result = found[kind][case].get(name)
+        if result is None:
+            continue
+        fits, broken = result.get("cause") != UNFIT, "broken" in result
+        values[row, column] = np.nan if broken else min(result["error"], 1.0)
+        end = f"{result['broken']:.2f} T: {result['cause']}" if broken else f"{result['error']:.2f}"
+        axis.text(column, row, end if fits else UNFIT, ha="center", va="center", fontsize=8,
+                  color="white" if broken and fits or values[row, column] > 0.55 else "black")
+        if broken:
+            axis.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, color="black" if fits else "0.85", linewidth=0))
     shown = axis.imshow(values, cmap="viridis_r", vmin=0, vmax=1, aspect="auto")
-    axis.set_yticks(range(len(rows)), [f"{kind}: {case}" for kind, case in rows], fontsize=7)
+    axis.set_yticks(range(len(rows)), [case for _, case in rows], fontsize=8)
+    for kind, each in found.items():
+        first = rows.index((kind, next(iter(each))))
+        axis.axhline(first - 0.5, color="white", linewidth=2)
+        axis.text(-0.45, first, kind, transform=axis.get_yaxis_transform(), va="center", fontsize=8)
     axis.set_xticks(range(len(names)), names)
     axis.xaxis.tick_top()
+    axis.tick_params(length=0)
     axis.grid(False)
-    drawn.colorbar(shown, ax=axis, label="velocity error at T/2 (1: or more)", fraction=0.05, pad=0.02)
+    drawn.colorbar(shown, ax=axis, label="velocity error at T/2", orientation="horizontal", fraction=0.02, pad=0.02)
     return drawn
 
 
@@ -251,8 +261,8 @@ def main(ladder: Path, chosen: list[str]) -> None:
         if name not in results:
             try:
                 results[name] = compute()
-            except ValueError:  # the radius is above half the box
-                results[name] = {"broken": 0.0, "cause": "does not fit"}
+            except ValueError:
+                results[name] = {"broken": 0.0, "cause": UNFIT}
             known.write_text(json.dumps(found))  # a stopped script goes on here
             print(f"{axis}: {case}: {name}: {results[name]}", flush=True)
     (OUTPUT / "stability-map.json").write_text(json.dumps(found, indent=1) + "\n")
