@@ -109,12 +109,13 @@ def drawn(run: Path, names: list[str]) -> list[Variant]:
 
 @styled
 def figure_8(rows: list[tuple[str, list[Variant], list[StoredRun]]]):
-    """Draw energy spectra up to k_d over those of the true tracers, at the start, the middle and the end; a row for
+    """Draw energy spectra up to k_d over those of the true tracers, at the times of the rollouts' spectra; a row for
     each flow.
 
     Spectra of particles are those of the field that the learned kernel reconstructs, as in the paper.
     """
-    figure, axes = panels(len(rows), 3, (3.5, 3.1), sharex=True, sharey=True)
+    times = len(rows[0][1][0].tables["flow_spectra"]["time"])
+    figure, axes = panels(len(rows), times, (3.5, 3.1), sharex=True, sharey=True)
     for row, (title, rollouts, stored) in zip(axes, rows):
         flow, cutoff = rollouts[0].tables["flow_spectra"], rollouts[0].numbers["rollout"]["filter_wavenumber"]
         shown = np.arange(1, int(cutoff) + 1)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eddies.analysis.rollout import Rollout, spread
+from eddies.analysis.rollout import Rollout
 
 SHELLS, CELLS = np.arange(6), 12
 
@@ -30,7 +30,8 @@ def rollout(model=(0.0, 0.5, 1.0, 1.5), truth=(0.0, 0.5, 1.0), flow=(0.0, 1.0, 1
     spectra = {name: dict(enumerate(energies(times, 6, factor)))
                for name, times, factor in (("model", model, 1.2), ("truth", truth, 0.9))}
     table = {"time": np.array(flow), "wavenumber": np.arange(shells), "filtered": energies(flow, shells)}
-    return Rollout({"start_time": 1.0}, Still(model, broken), Still(truth), table, {}, spectra, None)
+    return Rollout({"start_time": 1.0, "eddy_turnover_time": 1.0}, Still(model, broken), Still(truth), table,
+                   {"kolmogorov_time": 0.1}, spectra, None)
 
 
 def test_spectra_at_a_common_frame():
@@ -58,7 +59,22 @@ def test_common_frames_before_the_model_broke():
     for alone in (rollout(broken=0), rollout(truth=(7.0,))):
         with pytest.raises(ValueError, match="no time at which"):
             alone.common
-    assert spread(np.arange(9), 3).tolist() == [0, 4, 8] and spread(np.arange(2), 3).tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("end, expected", [
+    (21, [0, 1, 5, 10, 20]),  # times 0, 0.1, T/2 = 0.5, T = 1 and the end 2
+    (11, [0, 1, 5, 10]),      # the end is T
+    (12, [0, 1, 5, 11]),      # and is so close to T that both need no column
+    (4, [0, 1, 3]),
+    (1, [0]),
+])
+def test_the_times_of_figures_are_those_of_the_table(end, expected):
+    times = np.arange(end) / 10
+    run = rollout(model=times, truth=times, flow=1 + times)
+    assert run.shown(np.arange(end)).tolist() == expected
+    assert run.shown_spectra().tolist() == expected
+    if end == 21:  # only even frames have a spectrum of the flow
+        assert rollout(times, times, 1 + times[::2]).shown_spectra().tolist() == [0, 4, 10, 20]
 
 
 @pytest.mark.parametrize("unit", [1e-9, 1e9])

@@ -61,9 +61,9 @@ def test_numbers_and_tables_of_a_forced_rollout(comm, directory):
     for key in ("velocity_kl", "acceleration_kl", "qr_kl", "qr_kl_floor", "structure_error", "tetrad_size_error"):
         assert rollout[key] == accuracy[key]
     assert forced["energy"]["model"] > 0 and forced["qr_kl"] > 0
-    # Three times of PDFs and spectra, four of planes, and all common frames of the errors.
+    # Three times of figures, start, Kolmogorov time and end, and all common frames of the errors.
     assert [len(tables[name]["time"]) for name in ("velocity_pdfs", "spectra", "planes", "errors", "model")] == [
-        3, 3, 4, 6, 9]
+        3, 3, 3, 6, 9]
     for column in ("velocity", "acceleration"):
         assert tables[f"{column}_pdfs"]["model"].sum(axis=1) == pytest.approx(1)
         assert tables["errors"][f"{column}_kl"][-1] == rollout[f"{column}_kl"]
@@ -87,7 +87,7 @@ def test_measures_are_read_with_axes_and_units(comm, directory):
             ("paths_truth", "tetrad_shape", ("time", "eigenvalue"), None)):
         array = run[f"measures/{group}"][column]
         assert array.dims == axes and array.attrs.get("units") == units, (group, column)
-    assert run["measures/planes"]["time"].attrs["units"] == "T" and run["measures/planes"].sizes["time"] == 4
+    assert run["measures/planes"]["time"].attrs["units"] == "T" and run["measures/planes"].sizes["time"] == 3
 
 
 @pytest.mark.mpi(1)

@@ -10,7 +10,6 @@ import numpy as np
 from eddies.analysis.velocity_gradients import Invariants
 from eddies.clock import ROUND_OFF, SAME
 
-SHOWN = 3  # largest number of times at which spectra of a rollout are measured
 # Columns by name. A table of spectra has wavenumber (shells,), time (m,), energy (m, shells).
 Table = Mapping[str, np.ndarray]
 
@@ -177,9 +176,19 @@ class Rollout:
         """Return the indices of the common frames at whose times the spectrum of the flow is stored."""
         return np.flatnonzero(self._has_flow(self.common.times))
 
+    def shown(self, rows: np.ndarray) -> np.ndarray:
+        """Return those of the common frames `rows` that are nearest to the times of the figures.
+
+        These are the start, the Kolmogorov time, T/2 and T, as far as they are clearly before the end, and the end.
+        """
+        times = self.common.times[rows]
+        early = [time for time in (0.0, self.reference["kolmogorov_time"], self.turnover / 2, self.turnover)
+                 if time < 0.9 * times[-1]]
+        return rows[np.unique(np.abs(times - np.array([*early, times[-1]])[:, None]).argmin(1))]
+
     def shown_spectra(self) -> np.ndarray:
-        """Return at most SHOWN of the indices that `spectral` returns, evenly spread."""
-        return spread(self.spectral(), SHOWN)
+        """Return those of the indices that `spectral` returns which the figures show."""
+        return self.shown(self.spectral())
 
     def late_spectra(self) -> np.ndarray:
         """Return the frame numbers over which the spectrum of the model is averaged.
@@ -218,11 +227,6 @@ def second_half(times: np.ndarray, end: float) -> np.ndarray:
     """
     rows = np.flatnonzero((times >= end / 2) & (times <= end * (1 + ROUND_OFF)))
     return rows if rows.size else np.array([max(int(np.searchsorted(times, end, "right")) - 1, 0)])
-
-
-def spread(values: np.ndarray, count: int) -> np.ndarray:
-    """Return at most `count` of the values (m,), evenly spread from the first to the last."""
-    return values[np.unique(np.rint(np.linspace(0, len(values) - 1, count)).astype(int))]
 
 
 def _contained(times: np.ndarray, among: np.ndarray) -> np.ndarray:

@@ -12,12 +12,11 @@ from eddies.analysis.forced import forced_averages
 from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.lagrangian import differences, of_both
 from eddies.analysis.pdfs import bin_centres, bin_probabilities, kl_divergence, standardized
-from eddies.analysis.rollout import SHOWN, Rollout, spread
+from eddies.analysis.rollout import Rollout
 from eddies.measures import MEASURES
 
 Tables = dict[str, dict[str, np.ndarray]]
 BOTH = "model", "truth"
-PLANES = 4  # largest number of times at which planes are measured
 FEWEST = 8  # smallest number of particles in a cell of the Q-R plane whose mean motion is kept
 OVER_LAGS = "structure", "flatness", "acceleration_correlation"
 
@@ -130,7 +129,7 @@ def _particles(run: Rollout) -> tuple[dict[str, Any], Tables]:
     numbers = {"energy_ratio": float(model[-1] / truth[-1]), "energy_ratio_no_force": float(truth[0] / truth[-1]),
                "velocity_error": float(errors["velocity_error"][-1]), "early_time": early / run.turnover,
                "early_velocity_error": early_error, "early_velocity_error_no_force": early_without}
-    chosen = spread(np.arange(len(common.times)), SHOWN)
+    chosen = run.shown(np.arange(len(common.times)))
     tables = {"errors": errors}
     for column, edges in EDGES.items():
         pairs = [run.pair(index, column) for index in chosen]
@@ -142,10 +141,10 @@ def _particles(run: Rollout) -> tuple[dict[str, Any], Tables]:
 
 
 def _planes(run: Rollout) -> tuple[dict[str, Any], Tables]:
-    """Return u_x, vorticity magnitude and kinetic energy in planes, in single precision, at up to PLANES times."""
+    """Return u_x, vorticity magnitude and kinetic energy in planes, single precision, at the times of the figures."""
     if run.planes is None:
         return {}, {}
-    chosen = spread(np.arange(len(run.common.times)), PLANES)
+    chosen = run.shown(np.arange(len(run.common.times)))
     planes: dict[str, list[np.ndarray]] = {}
     for index in chosen:
         both = run.both(run.planes, index)

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from eddies.analysis.rollout import spread
-from eddies.analysis.rollout_measures import PLANES, Tables, measures, of_model
+from eddies.analysis.rollout_measures import Tables, measures, of_model
 from eddies.analysis.velocity_gradients import Invariants
 from eddies.io.errors import ProductError, WriteError
 from eddies.io.hdf5 import Table, create_product, in_files, open_product, read_table, write_table
@@ -124,7 +123,8 @@ def _tasks(opened: StoredRollout) -> list[Task]:
         return []
     chosen = {"spectra": run.shown_spectra()}
     if opened.fields:
-        chosen |= {"invariants": np.arange(len(common.times)), "planes": spread(np.arange(len(common.times)), PLANES)}
+        every = np.arange(len(common.times))
+        chosen |= {"invariants": every, "planes": run.shown(every)}
     tasks = [(quantity, of, int(frame)) for quantity, rows in chosen.items()
              for of, frames in (("model", common.model), ("truth", common.truth)) for frame in frames[rows]]
     if run.forced and opened.stationary is not None:
