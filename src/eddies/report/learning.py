@@ -14,7 +14,7 @@ LOSSES = (
     ("loss", "total", DNS), ("trajectory_loss", "trajectory $L_t$", MODEL),
     ("field_loss", "field $L_f$", BLUE), ("velocity_kl_loss", "velocity KL", SECOND),
     ("acceleration_kl_loss", "acceleration KL", FOURTH), ("rollout_loss", "velocity over the horizon", THIRD),
-    ("density_loss", "density over the horizon", "#e377c2"),
+    ("density_loss", "density over the horizon", "#7b3294"),
     ("energy_loss", "energy over the horizon", "#56B4E9"), ("power_loss", "power", "#8c564b"),
 )
 SMOOTHED = 0.04  # share of the steps of a phase over which a noisy curve is averaged
