@@ -1,5 +1,8 @@
 """The summary of variants: sentences, table, and the figure of error against run time."""
 
+import itertools
+
+import numpy as np
 import pytest
 
 from eddies.measures import DRAWN, MEASURES
@@ -55,6 +58,22 @@ def test_the_subject_and_the_most_accurate_of_the_front_are_named():
 def test_few_points_are_all_named_and_points_side_by_side_once():
     assert named(row("slow", 90.0, 0.4), row("none", 1.0, 0.5)) == {"learned", "slow", "none"}
     assert named(row("beside", 20.5, 0.101), row("none", 1.0, 0.5)) == {"learned", "none"}
+
+
+def test_names_cover_neither_names_nor_points():
+    """A long name to the left of the subject would reach into its name."""
+    rows = [ROWS[0], row("a-grid-with-a-long-name", 8.0, 0.1, kind="coarse grid"), row("none", 1.0, 0.5)]
+    axis = scatter(table_of(rows), DRAWN).axes[0]
+    assert texts(axis) == {each["name"] for each in rows}
+    boxes = [text.get_window_extent() for text in axis.texts]
+    assert not any(box.overlaps(other) for box, other in itertools.combinations(boxes, 2))
+    points = axis.transData.transform([(each["wall_seconds"], each["velocity_error_early"]) for each in rows])
+    assert not any(box.count_contains(points) for box in boxes)
+
+
+def test_the_subject_is_named_among_many_points():
+    crowd = [row(f"near-{angle}", 20.0 * 1.3 ** np.cos(angle), 0.1 * 1.3 ** np.sin(angle)) for angle in range(12)]
+    assert "learned" in named(*crowd)
 
 
 @pytest.mark.parametrize("methods", [1, 9])

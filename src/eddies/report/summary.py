@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.transforms import Bbox
 
 from eddies.analysis.pareto import COST, cheapest_grid, pareto_front, verdict
 from eddies.measures import DRAWN, MEASURES
@@ -21,7 +22,8 @@ COLUMNS = {"wall_seconds": "seconds a turnover", "training_seconds": "training (
            "velocity_error_early": "velocity error at t_η", "velocity_error_half": "at T/2",
            "velocity_error_end": "at the end", "spectrum_error": "spectrum error",
            "energy_ratio": "energy, model / truth"}
-MOST_NAMED, ROOM = 6, (0.18, 0.06)  # ROOM: width and height of a name, in those of a panel
+MOST_NAMED, NAME_SIZE, AWAY = 6, 8.5, 12  # names in a panel; their size in points; pixels from a point to its name
+CORNERS = ((1, 1), (-1, 1), (1, -1), (-1, -1))  # of a point, where its name may stand
 CAPTION = ("Wall seconds per turnover T, with the quartiles of the time of a step as bars. Bars of errors are standard "
            "deviations over realisations, if there are several. Dashed line: Pareto front, the variants that no other "
            "one beats in both error and time. Names: the first variant, bold, and the best of the front. Crosses: "
@@ -166,25 +168,58 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
             room = max(high / low, 2) ** 0.18  # for names
             limit(low / room, high * room)
         plain_log_ticks(part, subs=(1, 2, 5) if high < 300 * low else (1,))
-    for row in _named(axis, table, rows, measure, front):
-        axis.annotate(row["label"], (row[COST], row[measure]), (6, 6), textcoords="offset points", fontsize=8.5,
-                      annotation_clip=False, zorder=5, fontweight="bold" if row["name"] == table.subject else "normal")
+    _write_names(axis, table, rows, measure, front)
 
 
-def _named(axis: Axes, table: ErrorAgainstTime, rows: Sequence[Row], measure: str, front: Sequence[int]) -> list[Row]:
-    """Return at most MOST_NAMED rows whose points get a name: the subject, the most accurate of the front and, if there
-    are few points, the others. A point beside a named one gets none."""
+def _write_names(axis: Axes, table: ErrorAgainstTime, rows: Sequence[Row], measure: str, front: Sequence[int]) -> None:
+    """Name at most MOST_NAMED points: the subject, the most accurate of the front and, if there are few, the others.
+
+    A point that lies on a named one gets no name, nor does one whose name would cover a name or, unless it is the
+    subject, a point.
+    """
+    def place(row: Row, cost: str = COST) -> np.ndarray:
+        return axis.transData.transform((row[cost], row[measure]))
+
     wanted = [row for row in rows if row["name"] == table.subject] + [rows[index] for index in front[::-1]]
     if len(rows) <= MOST_NAMED:
         wanted += rows
-    named: list[Row] = []
-    places: list[np.ndarray] = []
+    points = [place(row, end) for row in rows for end in (COST, "wall_seconds_low", "wall_seconds_high")]
+    named: list[np.ndarray] = []
+    boxes: list[Bbox] = []
     for row in wanted:
-        place = axis.transAxes.inverted().transform(axis.transData.transform((row[COST], row[measure])))
-        if len(named) < MOST_NAMED and all((abs(place - other) > ROOM).any() for other in places):
-            named.append(row)
-            places.append(place)
-    return named
+        chosen = row["name"] == table.subject
+        if len(named) == MOST_NAMED or any(np.hypot(*(place(row) - other)) < 2 * AWAY for other in named):
+            continue
+        name = axis.annotate(row["label"], (row[COST], row[measure]), (0, 0), textcoords="offset pixels",
+                             fontsize=NAME_SIZE, annotation_clip=False, zorder=5,
+                             fontweight="bold" if chosen else "normal")
+        covered, corner, box = _corner_of_name(axis, place(row), name.get_window_extent().size, points, boxes)
+        if box is None or covered and not chosen:
+            name.remove()
+            continue
+        name.set(position=AWAY * np.array(corner), horizontalalignment="left" if corner[0] > 0 else "right",
+                 verticalalignment="bottom" if corner[1] > 0 else "top")
+        named.append(place(row))
+        boxes.append(box)
+
+
+def _corner_of_name(axis: Axes, place: np.ndarray, size: np.ndarray, points: Sequence[np.ndarray],
+                    boxes: Sequence[Bbox]) -> tuple[int, tuple[int, int], Bbox | None]:
+    """Return how many points a name covers at the best corner of its place, this corner, and the box of the name.
+
+    All lengths are in pixels. A corner out of the figure or left of the panel counts as one where all points are
+    covered. The box is None if a name of the given boxes is at each corner.
+    """
+    best: tuple[int, tuple[int, int], Bbox | None] = (len(points) + 1, CORNERS[0], None)
+    for corner in CORNERS:
+        start = place + AWAY * np.array(corner) + size * np.minimum(corner, 0)
+        box = Bbox([start, start + size])
+        around = box.padded(AWAY / 2)
+        outside = box.x0 < axis.bbox.x0 or box.x1 > axis.figure.bbox.x1
+        covered = len(points) if outside else around.count_contains(points)
+        if covered < best[0] and not any(around.overlaps(other) for other in boxes):
+            best = covered, corner, box
+    return best
 
 
 def in_symbols(words: str) -> str:
