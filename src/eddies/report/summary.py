@@ -214,7 +214,7 @@ def _corner_of_name(axis: Axes, place: np.ndarray, size: np.ndarray, points: Seq
     for corner in CORNERS:
         start = place + AWAY * np.array(corner) + size * np.minimum(corner, 0)
         box = Bbox([start, start + size])
-        around = box.padded(AWAY / 2)
+        around = box.padded(0.9 * AWAY)  # all but the point of the name itself
         outside = box.x0 < axis.bbox.x0 or box.x1 > axis.figure.bbox.x1
         covered = len(points) if outside else around.count_contains(points)
         if covered < best[0] and not any(around.overlaps(other) for other in boxes):
