@@ -94,7 +94,7 @@ def particle() -> Figure:
             (0.1, BLUE, "x: separation of a pair, in units of d"),
             (-0.5, SECOND, "v: difference of the velocities,\nin units of their rms u'"),
             (-1.5, "black", "Forces from a resolved velocity\ntake all particles of the box."),
-            (-2.36, GUIDE, "               mean spacing")):
+            (-2.36, GUIDE, "                 mean spacing")):
         axes.text(3.3, height, words, color=colour, fontsize=10, va="top")
     return figure
 

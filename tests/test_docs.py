@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import dataclasses
+import itertools
 import json
 import re
 import shlex
@@ -210,6 +211,15 @@ def test_a_cube_of_any_layout_is_converted(comm, tmp_path, convert, file):
     for number, datasets in enumerate(layouts):
         (folder := tmp_path / str(number)).mkdir()
         assert np.array_equal(convert(folder, file, datasets), velocity)
+
+
+@pytest.mark.parametrize("name, base", itertools.product(["my-cube.toml", "from-cube.toml"],
+                                                         ["tiny", "hit-small", "hit-coarse"]))
+def test_the_scene_of_a_cube_takes_any_base(folder, name, base):
+    """Also one whose flow starts in another way."""
+    Path(name).write_text(EXAMPLES[name].replace('base = "hit-small"', f'base = "{base}"'), encoding="utf-8")
+    scene = load_scene(name)
+    assert (scene.initial.kind, scene.initial.path, scene.forcing, scene.spin_up) == ("file", "my-cube.h5", None, None)
 
 
 def test_the_scene_with_an_own_pair_force_differs_from_the_published_system_in_this_force(folder):

@@ -23,12 +23,12 @@ from eddies.report.figures import BLUE, FILTERED, GRID, LOOKS, letter, panels, p
 
 DRAWN = ("velocity_error_half", "acceleration_kl")
 # Label, colour and marker of the variants.
-MARKERS = {"resolved": ("the resolved velocity", *LOOKS["resolved"]),
+MARKERS = {"resolved": ("resolved", *LOOKS["resolved"]),
            "grid": ("best grid of its cost, exact start", BLUE, GRID),
            "grid-particles": ("the same, start from particles", "#7db8dc", GRID),
-           "paper": ("the published form", *LOOKS["paper"]),
-           "transport-velocity": ("transport-velocity SPH", *LOOKS["transport-velocity"]),
-           "local": ("only neighbours", *LOOKS["local"]), "no-force": ("no force", *LOOKS["none"])}
+           "paper": ("paper", *LOOKS["paper"]),
+           "transport-velocity": ("transport-velocity", *LOOKS["transport-velocity"]),
+           "local": ("local", *LOOKS["local"]), "no-force": ("no-force", *LOOKS["none"])}
 
 Row = Mapping[str, Any]
 
@@ -78,7 +78,7 @@ def drawn(results: Sequence[Mapping[str, Any]]) -> Figure:
         axis.set(xscale="log", yscale="log", xlabel=r"width of the filter $d/\eta$",
                  ylabel=in_symbols(MEASURES[measure]))
         ticks = sorted(map(width_of, results))
-        axis.set_xticks(ticks, [f"{tick:.2g}" for tick in ticks])
+        axis.set_xticks(ticks, [f"{tick:.1f}" if tick < 10 else str(int(tick)) for tick in ticks])  # as pages name them
         axis.minorticks_off()
     letter(axes.flat)
     axes.flat[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))

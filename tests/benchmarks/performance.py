@@ -311,7 +311,7 @@ def over_particles(axis: Axes, found: dict) -> None:
     axis.loglog((cells / CELLS_A_PARTICLE) ** 3, [row["seconds_per_step"] / 4 for row in found["grid"]],
                 marker=GRID, color=BLUE, label="grid of 1.5 cells a particle")
     axis.loglog(64**3, NOTEBOOKS, "*", color="black", markersize=10)
-    axis.annotate("published notebooks", (64**3, NOTEBOOKS), xytext=(-6, -3), textcoords="offset points", ha="right")
+    axis.annotate("published notebooks", (64**3, NOTEBOOKS), xytext=(-9, -3), textcoords="offset points", ha="right")
     axis.loglog(64**3, PAPER, "P", color=MODEL, label="the paper, one A100")
     axis.set_xticks([side**3 for side in SIDES], [f"{side}³" for side in SIDES])
     axis.minorticks_off()
@@ -336,7 +336,7 @@ def parts(axis: Axes, found: dict) -> None:
             bound = found["bounds"][name] / cores
             axis.hlines(bound, place + shift - width / 2, place + shift + width / 2, color="black", linewidth=2,
                         label="least" if place == 0 and cores == 1 else None)
-    axis.set_xticks(range(5), names)
+    axis.set_xticks(range(5), names, fontsize=8)
     axis.set(title="64³ particles, with pairs", ylabel="seconds an evaluation")
     axis.legend()
 

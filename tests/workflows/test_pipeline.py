@@ -14,7 +14,6 @@ import torch
 from eddies.io.new_files import python_value
 from eddies.io.weights import load_weights
 from eddies.learning.training import shared_values
-from eddies.parallel.step_times import NOT_COMPARABLE
 from eddies.scene.model import BUILT_IN_PREFIX, WEIGHTS, built_in_weights
 from eddies.scene.scene import load_scene
 from eddies.stored_run import open_run
@@ -22,6 +21,7 @@ from eddies.workflows.diff import numbers_of
 from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.learned.training_data import training_data
+from eddies.workflows.report import NOT_COMPARABLE
 from tests.commands import first_rank, run_cli
 from tests.left_out import leave_out_figures
 from tests.small_scene import TINY

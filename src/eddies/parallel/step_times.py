@@ -17,7 +17,6 @@ from eddies.parallel.reduction import global_max
 
 LARGEST_SURPLUS = 0.5   # a job on all cores has a load of about their number; each further process adds 1
 LARGEST_RATIO = 1.5     # of the upper to the lower quartile of the seconds of a step
-NOT_COMPARABLE = "times are not comparable: the machine was busy"
 
 
 class StepTimes:

@@ -29,7 +29,7 @@ from eddies.io.provenance import (others_trained_on, product_attributes, product
 from eddies.io.trajectories import Trajectory
 from eddies.measures import finite
 from eddies.parallel.communicator import Comm
-from eddies.parallel.step_times import NOT_COMPARABLE, quartiles, was_busy
+from eddies.parallel.step_times import quartiles, was_busy
 from eddies.parallel.stop import StopRequest
 from eddies.pipeline import FILE_OF, MAKER_OF
 from eddies.report import (figures, ground_truth, kernel, models, reconstruction, rollouts, stationary, steps, summary,
@@ -53,6 +53,7 @@ SIMULATION = "dns_seconds_per_turnover"
 COSTS = {"dns_seconds_per_step": "DNS: seconds of a step (median, without storing)",
          SIMULATION: "DNS: wall seconds per turnover (median step, mean number of steps)",
          "busy": "the machine was busy", "stage_seconds": "wall seconds by stage"}
+NOT_COMPARABLE = "times are not comparable: the machine was busy"
 REASONS = {SIMULATION: "the simulation took no step",
            "stage_seconds": "no stage_seconds.json: the stages were not run by `eddies`"}
 SOURCE_OF_TRACKS = ("{in_file} measured tracks from {file}, on average {mean_count:.0f} in a frame; {complete} are in "
