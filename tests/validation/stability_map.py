@@ -31,6 +31,7 @@ from eddies.flow.tracers import lattice_positions
 from eddies.io.weights import load_weights
 from eddies.parallel.slab import SlabDecomposition
 from eddies.report.figures import panels, png, styled
+from eddies.report.summary import in_symbols
 from eddies.scene.model import WEIGHTS
 from eddies.scene.scene import Scene, load_scene
 from eddies.spectral.interpolation import SplineInterpolation
@@ -239,11 +240,11 @@ def figure(found: dict[str, dict[str, dict[str, Outcome]]], names: list[str]):
         if broken:
             axis.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, color="black" if fits else "0.85", linewidth=0))
     shown = axis.imshow(values, cmap="viridis_r", vmin=0, vmax=1, aspect="auto")
-    axis.set_yticks(range(len(rows)), [case for _, case in rows], fontsize=8)
+    axis.set_yticks(range(len(rows)), [in_symbols(case) for _, case in rows], fontsize=8)
     for kind, each in found.items():
         first = rows.index((kind, next(iter(each))))
         axis.axhline(first - 0.5, color="white", linewidth=2)
-        axis.text(-0.45, first, kind, transform=axis.get_yaxis_transform(), va="center", fontsize=8)
+        axis.text(-0.45, first, in_symbols(kind), transform=axis.get_yaxis_transform(), va="center", fontsize=8)
     axis.set_xticks(range(len(names)), names)
     axis.xaxis.tick_top()
     axis.tick_params(length=0)

@@ -188,5 +188,5 @@ def _named(axis: Axes, table: ErrorAgainstTime, rows: Sequence[Row], measure: st
 
 
 def in_symbols(words: str) -> str:
-    """Return a text in which the symbols t_η and k_d are written as formulas."""
-    return words.replace("t_η", r"$t_\eta$").replace("k_d", "$k_d$")
+    """Return a text in which the symbols t_η, k_d and M_t are written as formulas."""
+    return words.replace("t_η", r"$t_\eta$").replace("k_d", "$k_d$").replace("M_t", "$M_t$")
