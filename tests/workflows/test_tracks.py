@@ -1,6 +1,7 @@
 """Measured tracks in the place of a direct simulation; here they are the tracers of one, so the truth is known."""
 
 import json
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -473,6 +474,7 @@ def test_a_volume_thinner_than_half_a_spacing_is_refused(comm, tmp_path, thickne
     if fits:
         assert tracks.with_tracks(scene, comm).tracers.spacing < 0.036 * 2 * np.pi
         assert [*read_measured(scene.tracks).about["periods"]] == [1, 1, 7]
+        assert [*read_measured(replace(scene.tracks, filtered=True)).about["periods"]] == [1, 1, 1]
         return
     with pytest.raises(SceneError, match="volume: .*flat.h5: it is .*e-05 thick along z, .* least 0.018 thick"):
         tracks.with_tracks(scene, comm)

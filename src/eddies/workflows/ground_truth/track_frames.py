@@ -315,7 +315,7 @@ def _region(found: Tracks, settings: Settings) -> tuple[np.ndarray, np.ndarray, 
 
     A measured volume that is not periodic lies in the middle of a larger cube, at least [tracks] margin away from its
     periodic images. Along a short edge of the volume there is room for several images, so the flow has a shorter period
-    and fewer modes.
+    and fewer modes. For filtered tracks, of which solves were no faster and less accurate, it has one period.
     """
     if settings.volume is None:
         edge = settings.box if settings.box is not None else found.edge
@@ -337,7 +337,8 @@ def _region(found: Tracks, settings: Settings) -> tuple[np.ndarray, np.ndarray, 
         raise SceneError(_flat(settings, edges, count))
     margin = MARGIN * spacing if settings.margin is None else settings.margin
     edge = float(edges.max()) + margin
-    return lower, upper, edge, np.floor(edge / (edges + margin) * (1 + EQUAL)).astype(int)
+    periods = np.ones(3) if settings.filtered else np.floor(edge / (edges + margin) * (1 + EQUAL))
+    return lower, upper, edge, periods.astype(int)
 
 
 def _flat(settings: Settings, edges: np.ndarray, count: float) -> str:
