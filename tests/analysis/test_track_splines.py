@@ -30,12 +30,35 @@ def test_the_noise_of_velocities_is_that_of_splines_of_noise(frames, smoothing):
     rows they give the sum to 2 % too."""
     time = INTERVAL * np.arange(frames)
     fit = Fit(time, np.zeros((1, frames, 3)), INTERVAL)
-    found = fit.velocity_noise(smoothing) * INTERVAL**2
+    found = fit.velocity_errors(smoothing, time)[:, 0].sum() * INTERVAL**2
     if frames == 3:
         assert found == pytest.approx(2 * 26 / 4 + 1 / 2)
     draws = np.random.default_rng(3).standard_normal((frames, 2000))
     direct = np.mean(fit.spline(smoothing, draws).derivative()(time) ** 2, axis=1).sum() * INTERVAL**2
     assert found == pytest.approx(direct, rel=0.04)
+
+
+@pytest.mark.parametrize("frames", [20, 60])
+def test_velocities_have_errors_of_noise_and_of_smoothing(frames):
+    """3000 motions whose jerk is white noise. In their middle the smoothing of the motion is a quarter of the error.
+
+    For 60 frames 32 sets of random data give the sum, most of which is at both ends, to 25 %."""
+    smoothing, draw = 100.0, np.random.default_rng(4)
+    time, jerks = INTERVAL * np.arange(frames), draw.standard_normal((frames - 1, 3000)) / np.sqrt(smoothing)
+    state = np.zeros((3, 3000))  # position, velocity and acceleration, in units of the interval
+    motion = [state]
+    for jerk in jerks:
+        x, v, a = state
+        state = np.stack([x + v + a / 2 + jerk / 6, v + a + jerk / 2, a + jerk])
+        motion.append(state)
+    position, velocity = np.array(motion)[:, 0], np.array(motion)[:, 1] / INTERVAL
+    fit = Fit(time, np.zeros((1, frames, 3)), INTERVAL)
+    found = fit.spline(smoothing, position + draw.standard_normal(position.shape)).derivative()(time)
+    squares, errors = np.mean((found - velocity) ** 2, axis=1), fit.velocity_errors(smoothing, time)
+    assert squares[0] > 5 * squares[frames // 2] and 0.1 < errors[frames // 2, 1] / squares[frames // 2] < 0.5
+    if frames == 20:
+        np.testing.assert_allclose(errors.sum(1), squares, rtol=0.15)  # of 3000 motions: five standard deviations
+    assert errors.sum() == pytest.approx(squares.sum(), rel=0.05 if frames == 20 else 0.5)
 
 
 def test_velocities_of_smooth_tracks_without_noise():
@@ -69,7 +92,7 @@ def test_noise_is_removed_and_its_strength_sets_the_smoothing():
     assert kept < 0.6 * noise  # a filter with a cut-off at a third of the frequencies leaves 0.58 of white noise
     assert error(found.velocity, velocity[rows]) < 0.25 * error(untreated.velocity, velocity[untreated.rows])
     # Without smoothing all of the error is noise.
-    assert untreated.velocity_noise * noise == pytest.approx(
+    assert np.sqrt(untreated.velocity_errors[:, 0].mean()) * noise == pytest.approx(
         np.sqrt(np.mean((untreated.velocity - velocity[untreated.rows]) ** 2)), rel=0.05)
 
 

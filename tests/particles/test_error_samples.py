@@ -89,6 +89,22 @@ def test_scales_beyond_the_modes_act_as_noise(comm):
     assert_honest(shares_within(solver.grid, modes - resolved, list(ErrorSamples(solver, 16).of(particles, modes, 0))))
 
 
+@pytest.mark.mpi(1, 2)
+def test_errors_of_splines_are_those_of_the_frame(comm):
+    """The levels are measured in a frame with a third of the noise. Errors alike at neighbours leave no residual."""
+    solver = solver_on(comm)
+    flow, alike, samples = flow_of(solver, 0, 1e-2), flow_of(solver, 1, 2e-3), ErrorSamples(solver, 16)
+    samples.measure(velocities_of(solver, flow, 0.05), 0.05)
+    particles = velocities_of(solver, flow + alike, 0.15)
+    modes = solver.of(particles).modes
+    at_points = solver.grid.at(alike, solver.grid.points(particles.position))
+    smoothed = (global_sum(comm, float(at_points.square().sum())) / (3 * COUNT)) ** 0.5
+    told, not_told = (shares_within(solver.grid, modes - flow, list(samples.of(particles, modes, 1, 0.15, size)))
+                      for size in (smoothed, 0.0))
+    assert_honest(told)
+    assert not_told[0, 0] < 0.6 < told[0, 0]
+
+
 @pytest.mark.mpi(2, 3)
 def test_samples_do_not_depend_on_the_number_of_ranks(comm):
     alone, found = comm.Split(comm.rank), []

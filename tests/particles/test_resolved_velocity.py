@@ -21,7 +21,7 @@ SIDE, PLANES = 12, 22
 RESOLVED = ("pressure", "stress", "viscosity", "damping", "relaxation")
 
 
-def units(side, width=2.0, **scales):
+def units(side=SIDE, width=2.0, **scales):
     """Flow with side^3 particles and a filter `width` times as wide as their spacing."""
     scales = ReferenceScales(**dict(
         filter_width=width * LENGTH / side, spacing=LENGTH / side, velocity=1.0, density_mean=1.0, density=0.01,
@@ -84,6 +84,20 @@ def test_modes_beyond_the_nyquist_wavenumber_are_found(comm):
     flow = resolution_on(slab, 8).of(particles)
     assert flow.grid.resolved == 6
     assert relative_error(flow, modes) < 0.06
+
+
+@pytest.mark.mpi(1, 2)
+def test_particles_in_one_period_determine_all(comm):
+    """The flow has two periods along z, and particles are in the upper one alone."""
+    modes = filtered_modes(4, 2 * LENGTH / SIDE) * (filtered_fields.WAVE[2] % 2 == 0)
+    position = positions(count=SIDE**3 // 2)
+    position[:, 2] = (position[:, 2] + LENGTH) / 2
+    slab, particles = distributed(comm, position, torch.from_numpy(filtered_fields.at(modes, position.numpy())),
+                                  planes=PLANES)
+    scales = units().scales
+    # As many particles a volume as in `test_known_modes_are_found`. Without the period half of the box is guessed.
+    assert relative_error(ResolvedVelocity.on_slabs(slab, scales, periods=(1, 1, 2)).of(particles), modes) < 0.03
+    assert relative_error(ResolvedVelocity.on_slabs(slab, scales).of(particles), modes) > 0.1
 
 
 def test_the_dissipation_range_dissipates_all_energy():

@@ -13,6 +13,9 @@ another flow of `hit`, and grids that start from the particles. At last trains `
 On the flow of `hit-small` it measures the shares of errors that are within the standard deviations of the error map.
 Prints means over the runs, of fields at all times after the first t_eta, and the standard deviations of several runs,
 and writes docs/results/tracks-NAME.json.
+
+Each row is kept in twin-NAME.json in the first run directory as soon as it is known. The same command goes on after a
+stop, and reads these rows in place of measuring them again; remove the file to do so.
 """
 
 import json
@@ -20,11 +23,13 @@ import shutil
 import sys
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -43,6 +48,7 @@ class Case:
 
     noise : standard deviation of a coordinate, over the mean spacing; velocities are then found by splines, as with
     `splines`. lost : whether tracks are lost. inner : side of a volume that is not periodic, over the edge of the cube.
+    samples : of the error map. frames : the first ones are used, None for all.
     """
 
     tracks: str
@@ -51,15 +57,20 @@ class Case:
     splines: bool = False
     lost: bool = False
     inner: float = 1.0
+    samples: int = 16
+    frames: int | None = None
 
 
-SAMPLES = 16    # of the error map
 SETS = {"hit": ("whole-8", "whole-16", "whole-32", "filtered-8", "filtered-16", "filtered-32"),
         "hit-256": ("whole-16", "whole-32", "filtered-16", "filtered-32"), "hit-small": ()}
-# Those whose error maps are compared with the errors.
-MAPPED = {"hit-small": [Case(f"{kind}-{side}", method, noise) for kind in ("whole", "filtered")
-                        for side, noise in ((8, 0.0), (16, 0.0), (32, 0.0), (16, 0.1))
-                        for method in ("least-squares", "memory")]}
+# Those whose error maps are compared with the errors. Where a memory has many modes, fields are those of the sixth and
+# ninth frame interval, 1.2 and 1.8 Kolmogorov times after the start.
+MAPPED = {"hit-small": [
+    *(Case(f"{kind}-{side}", "least-squares", noise, samples=16 if side < 32 else 8)
+      for kind in ("whole", "filtered") for side, noise in ((8, 0.0), (16, 0.0), (32, 0.0), (16, 0.1))),
+    Case("filtered-8", "memory"), Case("whole-8", "memory", samples=4, frames=10),
+    Case("filtered-16", "memory", samples=8), Case("filtered-16", "memory", noise=0.1, samples=8),
+    *(Case(name, "memory", samples=4, frames=10) for name in ("whole-16", "filtered-32"))]}
 # Done to the tracks of `hit` alone.
 FURTHER = [
     *(Case(name, method) for name in ("whole-16", "filtered-32") for method in ("kriging", "average")),
@@ -112,7 +123,7 @@ def write(case: Case, truth: h5py.File, path: Path, seed: int) -> str:
     times, position = (holder[f"position/{name}"][()] for name in ("time", "value"))
     velocity, draw = holder["velocity/value"][()], np.random.default_rng(seed)
     frame, track = (part.ravel() for part in np.indices(position.shape[:2]))
-    kept = np.ones(frame.size, bool)
+    kept = frame < (case.frames or len(times))
     if case.lost:
         rate = -np.log(1 - TURNOVER_LOSS) / reference["eddy_turnover_time"]
         kept &= times[frame] < draw.exponential(1 / rate, position.shape[1])[track]
@@ -224,7 +235,7 @@ def within_of(case: Case, run: Path, seed: int) -> dict[str, float]:
         filtered, times = truth["fields/filtered"], truth["particles/tracers/position/time"]
         every = 1 if case.method == "memory" else round(filtered["time"][1] / times[1])
         rest = (f'[reconstruction]\nmethod = "{case.method}"\ncells = {filtered.attrs["cells"]}\nevery = {every}\n'
-                f'fields = ["velocity", "gradient"]\nsamples = {SAMPLES}\nholdout = 0\n')
+                f'fields = ["velocity", "gradient"]\nsamples = {case.samples}\nholdout = 0\n')
         with made(case, run, seed, rest, ["dns", "reconstruct"]) as directory:
             if comm.rank == 0:
                 found = shares_within(case, directory, truth)
@@ -302,26 +313,46 @@ def combined(found: list[dict[str, float | None]]) -> dict[str, float]:
     return {name: float(np.mean(each)) for name, each in values.items()} | spreads
 
 
+class Rows:
+    """Rows of tables by a name, in a file: a row that is known is not measured again."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._comm = path, MPI.COMM_WORLD
+        self._known = self._comm.bcast(json.loads(path.read_text(encoding="utf-8"))
+                                       if self._comm.rank == 0 and path.exists() else {})
+
+    def of(self, name: str, measure: Callable[[], Any]) -> Any:
+        """Return the row with this name, which `measure` makes on all ranks if it is not known; collective."""
+        if name not in self._known:
+            self._known[name] = measure()
+            if self._comm.rank == 0:
+                self._path.write_text(json.dumps(self._known, default=float), encoding="utf-8")
+        return self._known[name]
+
+
 def main(name: str, runs: list[Path]) -> None:
     """Run all cases and forecasts on some flows of the scene `name`."""
     cases = [Case(tracks, method) for tracks in SETS[name] for method in ("least-squares", "memory")]
     cases += FURTHER if name == "hit" else []
-    fields = [case.__dict__ | combined([fields_of(case, run, seed) for seed, run in enumerate(runs)])
-              for case in cases]
+    rows = Rows(runs[0] / f"twin-{name}.json")
+
+    def on_all(measure: Callable[..., Any], *what: Any) -> list[Any]:
+        return [rows.of(f"{measure.__name__} {what} {run}", partial(measure, *what, run, seed))
+                for seed, run in enumerate(runs)]
+
+    fields = [case.__dict__ | combined(on_all(fields_of, case)) for case in cases]
     forecasts = []
     for tracks, weights in WEIGHTS[name].items():
-        found = [forecasts_of(tracks, weights, run, seed) for seed, run in enumerate(runs)]
+        found = on_all(forecasts_of, tracks, weights)
         forecasts += [{"tracks": tracks, "method": method} | combined([each[method] for each in found])
                       for method in found[0]]
-    learned = [{"tracks": tracks} | combined([learned_of(tracks, run, seed) for seed, run in enumerate(runs)])
-               for tracks in LEARNED.get(name, ())]
-    mapped = [case.__dict__ | combined([within_of(case, run, seed) for seed, run in enumerate(runs)])
-              for case in MAPPED.get(name, ())]
-    found = {"fields": fields, "forecasts": forecasts, "learned": learned, "mapped": mapped}
+    learned = [{"tracks": tracks} | combined(on_all(learned_of, tracks)) for tracks in LEARNED.get(name, ())]
+    mapped = [case.__dict__ | combined(on_all(within_of, case)) for case in MAPPED.get(name, ())]
+    results = {"fields": fields, "forecasts": forecasts, "learned": learned, "mapped": mapped}
     if MPI.COMM_WORLD.rank == 0:
-        text = json.dumps({key: rows for key, rows in found.items() if rows}, indent=1) + "\n"
+        text = json.dumps({key: table for key, table in results.items() if table}, indent=1) + "\n"
         (RESULTS / f"tracks-{name}.json").write_text(text, encoding="utf-8")
-        for row in chain(*found.values()):
+        for row in chain(*results.values()):
             print(row)
 
 

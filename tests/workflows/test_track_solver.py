@@ -1,5 +1,7 @@
 """The grid on which the modes of measured particles are solved for, and the particles that a solve leaves out."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -20,7 +22,7 @@ def test_the_grid_of_a_memory_has_the_planes_that_the_spectrum_of_the_flow_needs
     slab = slabs_for(comm, tracers, resolved, width, kolmogorov_length)
     reference = {"velocity_rms": 1.0, "acceleration_rms": 1.0, "density_mean": 1.0, "viscosity": 0.01,
                  "filter_width": width, "spacing": resolved.spacing, "kolmogorov_length": kolmogorov_length}
-    assert (slab.planes, solver_of(slab, reference, 1.0).grid.resolved) == (planes, highest)
+    assert (slab.planes, solver_of(slab, reference, (1, 1, 1), 1.0).grid.resolved) == (planes, highest)
 
 
 def particles_with(ids):
@@ -51,5 +53,5 @@ def test_ids_in_the_upper_bits_have_an_error_of_validation(comm):
     slab = slabs_for(comm, tracers, tracers, 1e-3 * tracers.spacing, 0.0)
     reference = {"velocity_rms": 0.7, "acceleration_rms": 1.0, "density_mean": 1.0, "viscosity": 0.0,
                  "filter_width": 1e-3 * tracers.spacing, "spacing": tracers.spacing, "kolmogorov_length": 0.0}
-    _, _, error = best_solver(particles_with(2**32 * np.arange(512)), lambda weight: solver_of(slab, reference, weight))
+    _, _, error = best_solver(particles_with(2**32 * np.arange(512)), partial(solver_of, slab, reference, (1, 1, 1)))
     assert 0 < error < 0.2

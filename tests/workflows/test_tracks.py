@@ -1,6 +1,7 @@
 """Measured tracks in the place of a direct simulation; here they are the tracers of one, so the truth is known."""
 
 import json
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -272,7 +273,7 @@ def test_filtered_tracers_have_the_second_order_of_heun(comm):
 
 
 @pytest.mark.mpi(1)
-def test_fields_of_tracks_have_the_units_of_the_file(comm, twin, tmp_path, no_figures):
+def test_fields_of_tracks_have_the_units_of_the_file(comm, twin, tmp_path, no_figures, caplog):
     (tmp_path / "points.csv").write_text("x;y;z\n0;0;0\n10;0;5\n")
     scene = scene_of(comm, tmp_path, SECTION.format(path=twin / "tracks.csv", unit=MILLISECONDS) + f"""
 viscosity = {0.1 * (MILLIMETRES / (2 * np.pi))**2}
@@ -308,7 +309,9 @@ points = "points.csv"
         frame = int(np.argmin(np.abs(times - time)))
         rates = (tracers[frame + 1] - tracers[frame - 1]) / (times[frame + 1] - times[frame - 1])
         assert np.std(acceleration) == pytest.approx(np.std(rates) * MILLIMETRES / (2 * np.pi), rel=0.1)
+    caplog.set_level("INFO", "eddies")
     export.run(tmp_path / "run", tmp_path / "vtk", comm)
+    assert "particles-points is left out: its rows may be others in each frame" in caplog.text
     with h5py.File(tmp_path / "vtk/reconstruction-fields-reconstructed.vtkhdf") as file:
         np.testing.assert_allclose(file["VTKHDF"].attrs["Spacing"], MILLIMETRES / 14)
 
@@ -329,10 +332,12 @@ volume = [0, {side}, 0, {side}, 0, {side}]
 time_unit = {MILLISECONDS}
 filtered = true
 filter_width = {0.2 * MILLIMETRES}
+field_every = 3
 [reconstruction]
 method = "least-squares"
 cells = 20
 fields = ["velocity", "gradient"]
+every = 3
 particles = true
 """)
     run(scene, output=tmp_path / "run", comm=comm)
@@ -347,7 +352,7 @@ particles = true
         assert 5 < left_out.pop("tracks") < 40 and max(left_out.values()) < 1
         table = own["particles/tracks"]
         frame = 3
-        ids, position, velocity = (table[f"{name}/value"][frame] for name in ("track", "coordinates", "velocity"))
+        ids, position, velocity = (table[f"{name}/value"][-1] for name in ("track", "coordinates", "velocity"))
         there, ids = ids >= 0, ids.astype(int)
         assert 200 < there.sum() < 400 and (position[there] >= 0).all() and (position[there] <= side).all()
         tracers = true["particles/tracers/velocity/value"][frame][ids[there]] * MILLIMETRES / (2 * np.pi)
@@ -356,7 +361,7 @@ particles = true
         # The plane z in the middle of the volume, away from its faces.
         points = (np.arange(20) / 20 * 2 * np.pi * about["length_unit"] - about["corner"][0])
         inner = np.flatnonzero((points > 0.1 * side) & (points < 0.9 * side))
-        field = own["fields/reconstructed/velocity"][frame][:, inner][:, :, inner][:, :, :, inner]
+        field = own["fields/reconstructed/velocity"][-1][:, inner][:, :, inner][:, :, :, inner]
         whole = true["fields/filtered/velocity"][frame] * MILLIMETRES / (2 * np.pi)
     exact = at_points(whole, np.stack(np.meshgrid(*[points[inner] + lower] * 3, indexing="ij"), -1))
     assert relative(field, exact) < 0.2
@@ -412,15 +417,16 @@ def test_a_mean_flow_and_shear_change_no_error(comm, tmp_path, no_figures):
 path = "a.h5"
 volume = [0.99, 5.01, -0.01, 4.01, -0.01, 4.01]
 background = "linear"
+viscosity = 1e-3
 [reconstruction]
 fields = ["velocity", "gradient"]
 cells = 24
 every = 3
 particles = true
-holdout = 0.0
 """), output=folder, comm=comm)
         with h5py.File(folder / "reconstruction.h5") as file, h5py.File(folder / "ground_truth.h5") as truth:
             about, tracks_of = dict(file["about"].attrs), dict(truth["tracks"].attrs)
+            assert "memory" not in file["left_out"].attrs  # its forecasts have no mean shear
             made = {key: file[f"fields/reconstructed/{key}"][0].astype(float) for key in ("velocity", "gradient")}
             found = [file["particles/tracks/velocity/value"][0],
                      truth["particles/tracers/velocity/value"][0] * about["length_unit"]]
@@ -458,7 +464,8 @@ def test_a_background_without_a_volume_or_with_a_memory_is_refused(comm, tmp_pat
 @pytest.mark.parametrize("thickness, volume, fits", [(2e-5, "[0, 1, 0, 1, 0, 2e-5]", False), (2e-5, '"auto"', False),
                                                      (0.018, "[0, 1, 0, 1, 0, 0.018]", True)])
 def test_a_volume_thinner_than_half_a_spacing_is_refused(comm, tmp_path, thickness, volume, fits):
-    """400 tracks in a sheet are 0.05 apart. A volume of 0.018 has a mean spacing of 0.036."""
+    """400 tracks in a sheet are 0.05 apart. A volume of 0.018 has a mean spacing of 0.036, so with margins of four
+    spacings the cube has an edge of 1.14, and seven periods of 0.163 along z."""
     if comm.rank == 0:
         start = np.random.default_rng(1).random((400, 3)) * [1, 1, thickness]
         write_tracks(tmp_path / "flat.h5", np.repeat([0.0, 1.0, 2.0], 400), np.tile(np.arange(400), 3),
@@ -466,6 +473,8 @@ def test_a_volume_thinner_than_half_a_spacing_is_refused(comm, tmp_path, thickne
     scene = scene_of(comm, tmp_path, f'[tracks]\npath = "flat.h5"\nvolume = {volume}\n')
     if fits:
         assert tracks.with_tracks(scene, comm).tracers.spacing < 0.036 * 2 * np.pi
+        assert [*read_measured(scene.tracks).about["periods"]] == [1, 1, 7]
+        assert [*read_measured(replace(scene.tracks, filtered=True)).about["periods"]] == [1, 1, 1]
         return
     with pytest.raises(SceneError, match="volume: .*flat.h5: it is .*e-05 thick along z, .* least 0.018 thick"):
         tracks.with_tracks(scene, comm)

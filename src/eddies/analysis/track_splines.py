@@ -11,6 +11,11 @@ parabola, fitted by least squares.
 
 If the variance is not known, mu minimises the error of generalised cross-validation, n RSS / tr(R)^2, and the variance
 is RSS / tr(R) (Wahba 1983). RSS is the sum of the n squared residuals, R the matrix that maps positions to residuals.
+
+The error of a spline has two parts: what is left of the errors of positions, and what smoothing removes from the
+motion. If the jerk is white noise with the variance s^2 / (mu h^6) in each interval, where s^2 is the variance of a
+position, the spline is the mean of the motions that fit. Both parts are then the splines of random data: of positions
+with the variance s^2, and of jerks, which are to be found again at positions of zero.
 """
 
 from __future__ import annotations
@@ -45,10 +50,11 @@ class SmoothedTracks:
         Tracks with fewer than three rows are left out.
     time, track : time and number of the track, (rows,).
     position, velocity : (rows, 3). Positions are continuous along a track.
+    velocity_errors : (rows, 2), variances of the error of a velocity component, for errors of positions of variance 1:
+        of what is left of these errors, and of what smoothing removes from the motion.
     smoothing : mu of the splines.
     residual : noise that the residuals of the longest tracks show. It is the given noise if a mu fits it, and the
         estimate if none is given. It is NaN without noise, and for tracks of three rows, which have no residuals.
-    velocity_noise : rms error of a component of the velocity that errors of a coordinate with variance 1 cause.
     """
 
     rows: np.ndarray
@@ -56,9 +62,9 @@ class SmoothedTracks:
     track: np.ndarray
     position: np.ndarray
     velocity: np.ndarray
+    velocity_errors: np.ndarray
     smoothing: float
     residual: float
-    velocity_noise: float
 
 
 def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: float | None,
@@ -80,7 +86,8 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
     steps, within = np.diff(time[order]), np.diff(track[order]) == 0
     if not within.any():
         nothing = np.zeros((0, 3))
-        return SmoothedTracks(np.zeros(0, int), np.zeros(0), np.zeros(0, int), nothing, nothing, NO_NOISE, np.nan, 0.0)
+        return SmoothedTracks(np.zeros(0, int), np.zeros(0), np.zeros(0, int), nothing, nothing, nothing[:, :2],
+                              NO_NOISE, np.nan)
     interval = float(np.median(steps[within]))
     ends = np.append(np.flatnonzero(~within) + 1, len(order))
     alike: dict[bytes, list[np.ndarray]] = defaultdict(list)
@@ -95,14 +102,12 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
     smoothing, residual = (NO_NOISE, np.nan) if noise == 0 else _smoothing_of(fits, noise)
     parts = [_sampled(fit, smoothing, rows, time[rows[:, 0]], track[rows[:, 0]], fill)
              for fit, rows in zip(fits, groups)]
-    squares = [fit.tracks * fit.velocity_noise(smoothing) for fit in fits]
-    rows = sum(fit.tracks * len(fit.times) for fit in fits)
-    return SmoothedTracks(*map(np.concatenate, zip(*parts)), smoothing, residual, float(np.sqrt(sum(squares) / rows)))
+    return SmoothedTracks(*map(np.concatenate, zip(*parts)), smoothing, residual)
 
 
 def _sampled(fit: Fit, smoothing: float, rows: np.ndarray, start: np.ndarray, track: np.ndarray,
              fill: float | None) -> tuple[np.ndarray, ...]:
-    """Return the first five arrays of `SmoothedTracks` for the tracks of a fit, which begin at `start` (tracks,).
+    """Return the first six arrays of `SmoothedTracks` for the tracks of a fit, which begin at `start` (tracks,).
     `rows` (tracks, n) holds their row numbers."""
     times = fit.times
     if fill is not None:
@@ -111,7 +116,7 @@ def _sampled(fit: Fit, smoothing: float, rows: np.ndarray, start: np.ndarray, tr
         rows, known = np.full((len(rows), len(times)), -1), rows
         rows[:, frames] = known
     return (rows.ravel(), np.add.outer(start, times).ravel(), np.repeat(track, len(times)),
-            *fit.derivatives(smoothing, times))
+            *fit.derivatives(smoothing, times), np.tile(fit.velocity_errors(smoothing, times), (len(rows), 1)))
 
 
 class Fit:
@@ -145,8 +150,9 @@ class Fit:
                                        (2 * jerk.col, 2 * jerk.row + 3, jerk.data)):
             self._bands[WIDTH + rows - columns, columns] = entries
 
-    def spline(self, smoothing: float, values: np.ndarray | None = None) -> BSpline:
-        """Return the splines with mu = `smoothing` that approximate `values` (n, columns), by default the positions."""
+    def spline(self, smoothing: float, values: np.ndarray | None = None, jerks: np.ndarray | float = 0.0) -> BSpline:
+        """Return the splines with mu = `smoothing` that approximate `values` (n, columns), by default the positions.
+        Their J c approximates `jerks` (n - 1, columns)."""
         values = self._values if values is None else values
         # A line is a spline without jerk. Without the line between both ends, round-off is that of what is left.
         # Coefficients of a line are its values at the means of DEGREE successive knots.
@@ -156,6 +162,7 @@ class Fit:
         self._bands[WIDTH, 3:-3:2] = -1 / smoothing
         right = np.zeros((self._bands.shape[1], values.shape[1]))
         right[::2] = self._basis.T @ (values - line[:len(values)])
+        right[3:-3:2] = jerks
         solution = solve_banded((WIDTH, WIDTH), self._bands, right)[::2]
         return BSpline(self._knots, solution + line[len(values):], DEGREE)
 
@@ -174,12 +181,17 @@ class Fit:
         squares = np.sum((self.spline(smoothing)(self.times) - self._values) ** 2)
         return np.array([squares, 3 * self.tracks * left, 3 * self.tracks * freedom])
 
-    def velocity_noise(self, smoothing: float) -> float:
-        """Return the sum of the variances of a velocity component at all times of a track, for positions with errors of
-        variance 1. Tracks of more than RANDOM rows are tried with RANDOM sets of errors."""
+    def velocity_errors(self, smoothing: float, times: np.ndarray) -> np.ndarray:
+        """Return `SmoothedTracks.velocity_errors` at `times` (m,) of a track. For tracks of more than RANDOM rows they
+        are means over RANDOM sets of random data."""
         count, draw = len(self.times), np.random.default_rng(1)
-        errors = np.eye(count) if count <= RANDOM else draw.choice([-1.0, 1.0], (count, RANDOM)) / np.sqrt(RANDOM)
-        return float(np.sum(self.spline(smoothing, errors).derivative()(self.times) ** 2))
+        found = []
+        for size in (count, count - 1):
+            data = np.eye(size) if size <= RANDOM else draw.choice([-1.0, 1.0], (size, RANDOM)) / np.sqrt(RANDOM)
+            spline = self.spline(smoothing, data) if size == count else self.spline(
+                smoothing, np.zeros((count, data.shape[1])), data / np.sqrt(smoothing))
+            found.append((spline.derivative()(times) ** 2).sum(1))
+        return np.stack(found, 1)
 
     def derivatives(self, smoothing: float, times: np.ndarray) -> Iterator[np.ndarray]:
         """Yield positions, then velocities, of the splines at `times` (m,), each (tracks * m, 3), track after track."""

@@ -39,10 +39,14 @@ class ErrorSamples:
     the data show, so the errors are honest also where the penalty was chosen for another reason. The noise n is white
     and stands for errors of the velocities and for scales beyond the modes.
 
-    **Levels.** The prior's variance is c / penalty in the first frame, and the noise has the variance s^2. Both sums of
-    the minimum, the misfit and the penalty, have expected values that are linear in c and s^2. A few draws give the
-    coefficients, and the minimum of the first frame gives c and s^2. Later c and s^2 follow the mean square of the
-    velocities.
+    **Levels.** The prior's variance is c / penalty, and the noise has the variance s^2. Both sums of the minimum, the
+    misfit and the penalty, have expected values that are linear in c and s^2. A few draws give the coefficients, and
+    the minimum of one frame gives c and s^2. In other frames c and s^2 follow the mean square of the velocities.
+
+    **Smoothed tracks.** Velocities of splines have errors that are known in each frame. What is left of the noise of
+    positions is a part of s^2: the level is that of the rest, and each frame adds its own part. What smoothing removes
+    from the motion is alike at neighbours, so it is no noise of the solve. It is drawn as a velocity with the prior's
+    spectrum, and its level is never measured, since the estimate follows it.
 
     **Memory.** Each sample follows the estimate from frame to frame: `RememberedVelocity.deviation` makes w from the
     previous error and new random modes, so the spread grows by the forecasts and shrinks by the data.
@@ -59,32 +63,45 @@ class ErrorSamples:
 
     def __init__(self, solver: ResolvedVelocity, count: int, memory: RememberedVelocity | None = None) -> None:
         self.solver, self.count, self.memory = solver, count, memory
-        #: c and s^2, over the mean square of the velocity fluctuations
+        #: c and s^2 without the noise of splines, over the mean square of the velocity fluctuations
         self.levels: np.ndarray | None = None
         self._errors: list[Tensor] = []
 
     @torch.no_grad()
-    def of(self, particles: ParticleSet, modes: Tensor, frame: int) -> Iterator[Tensor]:
+    def measure(self, particles: ParticleSet, noise: float = 0.0) -> None:
+        """Measure the `levels` by the least squares of particles; `noise` is as in `of`."""
+        modes = self.solver.of(particles).modes
+        count, square = self._fluctuation(particles, modes, noise)
+        prior, variance = self._measured_levels(particles, modes, self.solver.grid.points(particles.position), count)
+        self.levels = np.array([prior, max(variance - noise**2, 0.0)]) / square if square > 0 else np.zeros(2)
+
+    @torch.no_grad()
+    def of(self, particles: ParticleSet, modes: Tensor, frame: int, noise: float = 0.0,
+           smoothed: float = 0.0) -> Iterator[Tensor]:
         """Yield the modes (3, kz, ky, kx) of each error of the estimate `modes` in the frame with this number.
 
-        Call this after the estimate, once in each frame, and use up the iterator.
+        `noise` and `smoothed` are rms errors of a velocity component, by splines: of what is left of the noise, and of
+        what smoothing removes from the motion. Call this after the estimate, once in each frame, and use up the
+        iterator. The first call measures the levels, if `measure` was not called.
         """
         if self.count == 0:
             return
+        if self.levels is None:
+            self.measure(particles, noise)
         grid, memory = self.solver.grid, self.memory
         equations, points = memory.equations if memory else self.solver.equations, grid.points(particles.position)
-        relative = particles.velocity - grid.mean(modes)
-        count, square = global_sum(grid.decomposition.comm,
-                                   np.array([len(relative), float(relative.square().sum()) / 3]))
-        if self.levels is None:
-            self.levels = self._measured_levels(particles, modes, points, count) * (count / square if square else 0.0)
-        prior, noise = np.sqrt(self.levels * square / count)
+        count, square = self._fluctuation(particles, modes, noise)
+        prior, spread = np.sqrt(self.levels * square + [0.0, noise**2])
         errors, self._errors = self._errors, []
         for sample in range(self.count):
             deviation = prior * self._random_modes(frame, sample)
             if errors and memory:
                 deviation = memory.deviation(errors[sample], deviation)
-            random = noise * normal(as_numpy(particles.id), frame, sample)
+            random = spread * normal(as_numpy(particles.id), frame, sample)
+            if smoothed > 0:
+                alike = grid.at(self._random_modes(frame, self.count + sample), points)
+                size = global_sum(grid.decomposition.comm, _square(alike)) / (3 * count)
+                random += smoothed / math.sqrt(size) * alike
             error = self._error(equations, points, random, deviation, count).modes
             if memory:
                 self._errors.append(error)
@@ -99,6 +116,13 @@ class ErrorSamples:
         """Inverse of `state_dict`."""
         self.levels = None if state["levels"] is None else np.array(state["levels"])
         self._errors = list(state["errors"].split(3)) if "errors" in state else []
+
+    def _fluctuation(self, particles: ParticleSet, modes: Tensor, noise: float) -> tuple[float, float]:
+        """Return the number of particles, and the mean square of a component of their velocity without its mean and its
+        noise."""
+        relative = particles.velocity - self.solver.grid.mean(modes)
+        count, square = global_sum(self.solver.grid.decomposition.comm, np.array([len(relative), _square(relative)]))
+        return count, max(square / (3 * count) - noise**2, 0.0)
 
     def _measured_levels(self, particles: ParticleSet, modes: Tensor, points: Points, count: float) -> np.ndarray:
         """Return c and s^2 with which the misfit and the penalty of the minimum have their expected values. They are 0

@@ -52,6 +52,12 @@ class FourierGrid(ModeOperators):
         self._zeroth = (self.shell == 0).to(dtype)
         self._transfers: dict[float, Tensor] = {}
 
+    def repeating(self, periods: Sequence[int]) -> Tensor:
+        """Return whether a mode (kz, ky, kx) has these numbers of periods along x, y and z, or multiples of them."""
+        unit = 2 * math.pi / self.decomposition.length
+        x, y, z = (torch.round(k / unit).long() % count == 0 for k, count in zip(self.wavevector, periods))
+        return x & y & z
+
     # ---- linear maps
 
     def to_modes(self, fields: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import NamedTuple
@@ -158,6 +158,7 @@ class ResolvedVelocity:
     filter_width : d of the filter.
     kolmogorov_length : eta of the flow; 0 if its spectrum has no dissipation range.
     weight : factor of the noise sigma^2.
+    periods : numbers of periods of the flow in the box along x, y and z. Particles in one of them determine the flow.
 
     Differentiable in the particles' positions and velocities: the backward pass solves the same system. All methods are
     collective. Raises HaloError on all ranks if a particle is farther outside its slab than the ghost planes reach.
@@ -172,17 +173,19 @@ class ResolvedVelocity:
     latest: Tensor | None = None
 
     def __init__(self, grid: FourierGrid, filter_width: float, kolmogorov_length: float = 0.0,
-                 weight: float = WEIGHT) -> None:
+                 weight: float = WEIGHT, periods: Sequence[int] = (1, 1, 1)) -> None:
         self.grid, self.filter_width = grid, filter_width
-        penalized = (grid.shell > 0) & (grid.shell <= grid.resolved)
+        inside = (grid.shell <= grid.resolved) & grid.repeating(periods)
+        penalized = (grid.shell > 0) & inside
         energy, unresolved = _prior(grid, filter_width, kolmogorov_length, penalized)
         penalty = torch.where(penalized, weight * unresolved / (3 * torch.where(penalized, energy, 1.0)), 0.0)
-        self.equations = LeastSquares(grid, grid.shell <= grid.resolved, penalty)
+        self.equations = LeastSquares(grid, inside, penalty)
         self.forget()
 
     @classmethod
     def on_slabs(cls, decomposition: SlabDecomposition, scales: ReferenceScales, margin: float = 0.0,
-                 dtype: torch.dtype | None = None, weight: float = WEIGHT) -> ResolvedVelocity:
+                 dtype: torch.dtype | None = None, weight: float = WEIGHT,
+                 periods: Sequence[int] = (1, 1, 1)) -> ResolvedVelocity:
         """Make an instance whose grid has as many cells along each axis as all slabs together have planes.
 
         Particles may be outside their slab by `margin` at most. The default precision is double.
@@ -191,7 +194,7 @@ class ResolvedVelocity:
                                    decomposition.planes)
         margin_planes = margin_for(margin, decomposition.spacing)
         grid = FourierGrid(decomposition, resolved, margin_planes, dtype or torch.float64)
-        return cls(grid, scales.filter_width, scales.kolmogorov_length, weight)
+        return cls(grid, scales.filter_width, scales.kolmogorov_length, weight, periods)
 
     def of(self, particles: ParticleSet, time: float | None = None, near: Tensor | None = None) -> ResolvedFlow:
         """Compute the resolved flow of particles.

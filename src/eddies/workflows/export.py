@@ -125,7 +125,7 @@ def _write(output: Path, case: str, group: str, series: Any, provenance: Provena
         log.info("export: %s is left out: a data set holds particles only", case)
         return False
     if group == "particles" and "position" not in series.columns:
-        log.info("export: %s is left out: a row is not the same track in all frames", case)
+        log.info("export: %s is left out: its rows may be others in each frame", case)
         return False
     if data_set and (problem := shortcoming(series)):
         log.warning("export: %s is left out: %s", case, problem)

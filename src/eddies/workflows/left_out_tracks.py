@@ -38,16 +38,17 @@ def kernel_of(tracers: Tracers) -> CubicSpline:
 def errors_at_left_out(scene: Scene, source: Source, file: File, comm: Comm) -> dict[str, float]:
     """Return the velocity error of each method at the tracks that [reconstruction] holdout leaves out; collective.
 
-    Methods are "least-squares", "memory" if the viscosity is known, "kriging" among neighbours, and "delaunay", linear
-    interpolation in the tetrahedra of the tracks that are kept. The error is |v - v_i| / |v'_i| over the left-out
-    tracks that lie in a tetrahedron, and the mean over the second half of the first FRAMES frames. `tracks` is their
-    mean number, and `floor` the error of the true velocity, if splines estimate the noise of the measured ones. The
-    result is empty for more than MOST_TRACKS tracks, or if fewer than LEAST_TRACKS are left out. `file` is the ground
-    truth.
+    Methods are "least-squares", "memory" if the viscosity is known and there is no background, "kriging" among
+    neighbours, and "delaunay", linear interpolation in the tetrahedra of the tracks that are kept. The error is |v -
+    v_i| / |v'_i| over the left-out tracks that lie in a tetrahedron, and the mean over the second half of the first
+    FRAMES frames. `tracks` is their mean number, and `floor` the error of the true velocity, if splines estimate the
+    noise of the measured ones. The result is empty for more than MOST_TRACKS tracks, or if fewer than LEAST_TRACKS are
+    left out. `file` is the ground truth.
     """
     settings = scene.reconstruction
     frames = range(0, len(source.times), settings.every)[:FRAMES]
-    methods = ("least-squares", "memory") if scene.flow.viscosity > 0 else ("least-squares",)
+    forecasts = scene.flow.viscosity > 0 and source.background is None
+    methods = ("least-squares", "memory") if forecasts else ("least-squares",)
     if source.most > MOST_TRACKS:
         log.info("reconstruct: more than %d tracks; methods are not compared at tracks that are left out", MOST_TRACKS)
         return {}

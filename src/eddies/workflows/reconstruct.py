@@ -153,7 +153,7 @@ class ReconstructionRun:
         """Return the standard deviations of the errors on the grid, and then at each of `sets`."""
         squares: list[dict[str, np.ndarray]] = [{} for _ in range(1 + len(sets))]
         medium = replace(self.medium, background=None)
-        for error in self.samples.of(particles, modes, frame):
+        for error in self.samples.of(particles, modes, frame, *self.source.velocity_errors[frame]):
             made = Quantities(error, self.grid, self.settings.deviations, medium)
             for total, values in zip(squares, [made.on(self.target), *map(made.at, sets)]):
                 for name, value in values.items():
@@ -232,6 +232,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                         expected.get("dissipation_share", 1.0) if settings.correct_dissipation else 1.0)
         whole = ReconstructionRun(source, methods, samples, settings, tracers, medium)
         saved = guard.checkpoints.newest()
+        if saved is None and settings.samples:
+            samples.measure(source.particles(source.surest), source.velocity_errors[source.surest, 0])
         if saved is not None:
             whole.load_state_dict(saved)
             log.info("reconstruct: continues from frame %d", whole.steps)
@@ -251,8 +253,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                                                           for key in table[0]}, "time", {"time": "T", "seconds": "s"}))
                 set_attributes(product.create_group("about"), {
                     "method": settings.method, "particles": (BOX_LENGTH / source.spacing) ** 3, "weight": weight,
-                    "length_unit": source.unit, "corner": source.corner, "holdout": holdout,
-                    "highest_wavenumber": grid.resolved, "samples": settings.samples, **expected})
+                    "length_unit": source.unit, "corner": source.corner, "periods": source.periods,
+                    "holdout": holdout, "highest_wavenumber": grid.resolved, "samples": settings.samples, **expected})
     guard.checkpoints.remove()
     log.info("reconstruct: %s; means over time: %s", settings.method, ", ".join(
         f"{key.replace('_', ' ')} {np.nanmean([row[key] for row in table]):.3g}"

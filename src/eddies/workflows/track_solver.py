@@ -1,7 +1,7 @@
 """Least squares for measured particles. Cross-validation finds the weight of the noise."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -138,7 +138,8 @@ def slabs_for(comm: Comm, tracers: Tracers, resolved: Tracers, filter_width: flo
     return SlabDecomposition(comm, BOX_LENGTH, min(max(planes, least), most))
 
 
-def solver_of(slab: SlabDecomposition, reference: Mapping[str, float], weight: float) -> ResolvedVelocity:
+def solver_of(slab: SlabDecomposition, reference: Mapping[str, float], periods: Sequence[int],
+              weight: float) -> ResolvedVelocity:
     """Make the least-squares solver with this weight of the noise. Each solve ends at the residual of one from zero.
 
     With the residual of a solve from a prediction, as in rollouts, the velocity error of filtered tracks without noise
@@ -146,13 +147,13 @@ def solver_of(slab: SlabDecomposition, reference: Mapping[str, float], weight: f
     of 13.
 
     `reference` holds the reference scales, with the names that they have in ground_truth.h5. The solver does not depend
-    on those of velocity and acceleration, which may be 0.
+    on those of velocity and acceleration, which may be 0. `periods` are those of the flow in the box.
     """
     scales = ReferenceScales(
         velocity=1.0, acceleration=1.0,
         **{name: reference[name] for name in ("filter_width", "spacing", "density_mean", "viscosity",
                                               "kolmogorov_length")})
-    solver = ResolvedVelocity.on_slabs(slab, scales, weight=weight)
+    solver = ResolvedVelocity.on_slabs(slab, scales, weight=weight, periods=periods)
     solver.tolerance_predicted = solver.tolerance
     return solver
 

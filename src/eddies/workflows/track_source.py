@@ -76,17 +76,19 @@ class Source:
     truth : the ground truth with true fields; None for measured tracks.
     periodic : whether the cube is a period of the flow, and no volume lies in it.
     uniform : whether all measured tracks of a frame have the same velocity.
+    periods : numbers of periods of the flow in the cube along x, y and z.
     background : the mean flow beside which the particles' velocities are; None without one.
     filtered : whether the tracks follow a filtered velocity.
     unit : the scene's unit of length, in the unit of the tracks.
     velocity_noise : rms error of a velocity component, from the noise of positions; 0 for velocities of the file.
+    velocity_errors, surest : as in `MeasuredTracks`; zeros without measured tracks.
     corner : position of the origin of the tracks' coordinates in the cube, in the unit of the tracks.
     """
 
     def __init__(self, tracks: Tracks | None, tracers: Tracers, settings: Reconstruction, file: File,
                  comm: Comm) -> None:
         self._tracks, self.truth, self.spacing, self.uniform = None, None, tracers.spacing, False
-        self.velocity_noise = 0.0
+        self.velocity_noise, self.surest, self.periods = 0.0, 0, np.ones(3, int)
         self.background: LinearFlow | None = None
         self.periodic = tracks is None or tracks.volume is None
         self.filtered, width = (tracks or tracers).filtered, tracers.filter_width
@@ -95,6 +97,8 @@ class Source:
             self.times, self.spacing, self.most = source.times, source.spacing, source.most
             self.uniform, self.background = source.uniform, source.background
             self.unit, self.corner = source.about["length_unit"], source.about["corner"]
+            self.periods = source.about["periods"]
+            self.velocity_errors, self.surest = source.velocity_errors, source.surest
             self.velocity_noise = source.about.get("velocity_noise", 0.0) / self.unit
             tracers = tracers.with_count(count_for(self.spacing))
         resolved = settings.resolving(tracers, self.filtered)
@@ -103,7 +107,7 @@ class Source:
         self.slab = slabs_for(comm, tracers, resolved, width, self.scales["kolmogorov_length"])
         if tracks is None:
             self.truth = truth = GroundTruth(file, comm, planes=self.slab.planes)
-            self.times, self.most = truth.times, truth.total
+            self.times, self.most, self.velocity_errors = truth.times, truth.total, np.zeros((len(truth.times), 2))
             self.unit, self.corner = 1.0, np.zeros(3)
 
     def particles(self, frame: int) -> ParticleSet:
@@ -114,10 +118,10 @@ class Source:
         return ParticleSet.from_numpy({name: columns[name] for name in ("id", "position", "velocity")})
 
     def fitted(self, share: float) -> tuple[ResolvedVelocity, float, Tensor]:
-        """Return the solver with the best weight of the noise for the first frame (`best_solver`), this weight, and the
-        transfer function of the filter that the particles' velocity has passed; collective."""
-        solver, weight, _ = best_solver(self.particles(0), partial(solver_of, self.slab, self.scales), share,
-                                        self.uniform)
+        """Return the solver with the best weight of the noise for the surest frame (`best_solver`), this weight, and
+        the transfer function of the filter that the particles' velocity has passed; collective."""
+        solver, weight, _ = best_solver(self.particles(self.surest),
+                                        partial(solver_of, self.slab, self.scales, self.periods), share, self.uniform)
         grid = solver.grid
         transfer = grid.filter_transfer(self.scales["filter_width"]) if self.filtered else torch.ones_like(grid.shell)
         return solver, weight, transfer

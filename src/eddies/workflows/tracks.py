@@ -210,7 +210,7 @@ def write_frames(file: File, flows: FittedFlows, tracks: TrackFrames, tracers: T
 
 
 class FittedFlows:
-    """The velocity fields of measured tracks, by one method for all frames, which the first frame determines. The
+    """The velocity fields of measured tracks, by one method for all frames, which the surest frame determines. The
     constructor is collective.
 
     slab, grid, method: the slabs, the grid, and the method that finds the modes of a frame. reference: the scales of
@@ -230,8 +230,9 @@ class FittedFlows:
         # The first pass does not know the Kolmogorov length. The prior of the second pass uses that of the first pass.
         for resolved in (own, settings.resolving(own, filtered))[:2 if viscosity > 0 else 1]:
             self.slab = slabs_for(tracks.comm, own, resolved, width, self.reference["kolmogorov_length"])
-            make = partial(solver_of, self.slab, self.reference | {"spacing": resolved.spacing, "filter_width": width})
-            solver, self.weight, self.error = best_solver(particles_on(self.slab, tracks.frame(0)), make,
+            make = partial(solver_of, self.slab, self.reference | {"spacing": resolved.spacing, "filter_width": width},
+                           tracks.about["periods"])
+            solver, self.weight, self.error = best_solver(particles_on(self.slab, tracks.frame(tracks.surest)), make,
                                                           uniform=tracks.uniform)
             self.grid = solver.grid
             self.method = UniformMethod(solver) if tracks.uniform else LeastSquaresMethod(solver)

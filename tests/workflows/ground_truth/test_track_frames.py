@@ -107,9 +107,14 @@ def test_noise_of_positions_is_estimated_and_said(tmp_path, caplog, noise):
     found = read_measured(Tracks(path=str(tmp_path / "a.h5")))
     assert found.about["noise"] == pytest.approx(noise, rel=0.1)
     assert (found.about["velocity_noise"] > 0) == (noise > 0)
+    errors, middle = found.velocity_errors, len(found.times) // 2
+    assert errors.shape == (len(found.times), 2) and (errors > 0).all() == errors.any() == (noise > 0)
+    if noise:  # all tracks begin and end together
+        assert (errors[[0, -1]] > 2 * errors[middle]).all() and 0 < found.surest < len(errors) - 1
     assert logged(caplog, "noise of a coordinate is about 0.00" if noise else "too small to be estimated")
     written(tmp_path / "a.h5", rows, velocity=True)  # velocities that were measured are taken
-    assert "noise" not in read_measured(Tracks(path=str(tmp_path / "a.h5"))).about
+    taken = read_measured(Tracks(path=str(tmp_path / "a.h5")))
+    assert "noise" not in taken.about and not taken.velocity_errors.any() and taken.surest == 0
     assert read_measured(Tracks(path=str(tmp_path / "a.h5"), noise="auto")).about["noise"] == found.about["noise"]
 
 

@@ -42,18 +42,21 @@ class MeasuredTracks:
     starts : first row of each frame, and at the end the number of rows, (frames + 1,).
     columns : `id` (rows,), `position` and `velocity` (rows, 3). With [tracks] sound_speed also `density` (rows,), in
         units of its mean. Velocities are those beside the `background`.
+    velocity_errors : (frames, 2), rms errors of a velocity component in each frame, by the splines: of what is left of
+        the noise, and of what smoothing removes from the motion. They are 0 for velocities of the file.
     background : the mean flow of [tracks] background = "linear"; None without it.
     uniform : whether all tracks of a frame have the same velocity, in each frame.
     throughout : whether the track of a row is present in all frames, (rows,).
     spacing : mean particle spacing, the cube root of (volume with particles / mean number of rows of a frame).
     about : the attributes of the product that describe the file and the tracks. `length_unit` is the scene's unit of
         length, in the unit of the file. `corner` is the position in the periodic cube of the origin of the file's
-        coordinates, in the unit of the file.
+        coordinates, in the unit of the file. `periods` (3,) are the numbers of periods of the flow in the cube.
     """
 
     times: np.ndarray
     starts: np.ndarray
     columns: Mapping[str, np.ndarray]
+    velocity_errors: np.ndarray
     background: LinearFlow | None
     uniform: bool
     throughout: np.ndarray
@@ -64,6 +67,11 @@ class MeasuredTracks:
     def mean_count(self) -> float:
         """Mean number of rows of a frame."""
         return len(self.throughout) / len(self.times)
+
+    @property
+    def surest(self) -> int:
+        """The frame with the smallest `velocity_errors`."""
+        return int(np.argmin(np.square(self.velocity_errors).sum(1)))
 
     @property
     def complete(self) -> int:
@@ -93,9 +101,10 @@ class TrackFrames:
     def __init__(self, comm: Comm, settings: Settings) -> None:
         self.comm = comm
         (self.times, self.about, self.mean_count, self.complete, self.spacing, self.background, self.uniform,
-         self.most) = in_files(comm, settings.file, lambda: (
+         self.velocity_errors, self.surest, self.most) = in_files(comm, settings.file, lambda: (
              (found := read_measured(settings)).times, found.about, found.mean_count, found.complete, found.spacing,
-             found.background, found.uniform, int(np.diff(found.starts).max())))
+             found.background, found.uniform, found.velocity_errors, found.surest,
+             int(np.diff(found.starts).max())))
         self._tracks = read_measured(settings) if comm.rank == 0 else None
 
     def frame(self, number: int, complete: bool = False) -> dict[str, np.ndarray]:
@@ -137,16 +146,16 @@ def _read_measured(settings: Settings, versions: tuple[FileVersion, ...]) -> Mea
     if settings.sound_speed is not None and found.density is None:
         raise SceneError(f"[tracks] sound_speed = {settings.sound_speed:g}: {settings.file} has no densities; remove "
                          "the key")
-    lower, upper, edge = _region(found, settings)
+    lower, upper, edge, periods = _region(found, settings)
     period = edge if settings.volume is None else None
     about: dict[str, Any] = {"file": settings.path, "in_file": len(np.unique(found.track))}
     smoothed = found.velocity is None or settings.noise not in (None, 0)
     measured, interval = _at_frames(found, settings, settings.longest_gap if smoothed else 0)
     if smoothed:
-        found, noise = _smoothed(measured, period, interval, settings, about)
+        found, noise, errors = _smoothed(measured, period, interval, settings, about)
     else:
         check_velocities(measured, period, settings.file)
-        found, noise = measured, 0.0
+        found, noise, errors = measured, 0.0, np.zeros((len(measured.time), 2))
     if period is None or not _continuous(measured, period, noise):
         check_inside(measured, lower, upper, "box" if period else "volume", settings.file, noise)
     times = interval * np.arange(round(measured.time[-1] / interval) + 1)
@@ -172,13 +181,15 @@ def _read_measured(settings: Settings, versions: tuple[FileVersion, ...]) -> Mea
     if uniform:
         log.warning("%s: all tracks move alike%s: the velocity field is uniform, and there are no errors relative to "
                     "its fluctuation", settings.file, "" if background is None else " beside the background")
-    return MeasuredTracks(times, found.starts, columns, background, uniform, (counts == len(times))[place], spacing,
-                          about | {"length_unit": unit, "corner": corner})
+    errors = np.sqrt(np.add.reduceat(errors, found.starts[:-1]) / np.diff(found.starts)[:, None]) / unit
+    return MeasuredTracks(times, found.starts, columns, errors, background, uniform, (counts == len(times))[place],
+                          spacing, about | {"length_unit": unit, "corner": corner, "periods": periods})
 
 
 def _smoothed(found: Tracks, period: float | None, interval: float, settings: Settings,
-              about: dict[str, Any]) -> tuple[Tracks, float]:
-    """Return the tracks with the positions and velocities of splines, and the noise of a coordinate.
+              about: dict[str, Any]) -> tuple[Tracks, float, np.ndarray]:
+    """Return the tracks with the positions and velocities of splines, the noise of a coordinate, and the variances
+    (rows, 2) of the errors of a velocity component.
 
     A track that lacks more than [tracks] longest_gap frames is divided there; shorter gaps are filled, unless the
     tracks have densities. Attributes of the product are added to `about`.
@@ -202,14 +213,15 @@ def _smoothed(found: Tracks, period: float | None, interval: float, settings: Se
                  if noise else "too small to be estimated")
     elif given > 0 and not 1 / FITTING < splines.residual / given < FITTING:
         log.warning("%s", _noise_misfit(settings, splines.residual))
-    about |= {"noise": noise, "velocity_noise": noise * splines.velocity_noise}
+    errors = noise**2 * splines.velocity_errors[order]
+    about |= {"noise": noise, "velocity_noise": float(np.sqrt(errors[:, 0].mean()))}
     counts = {"tracks are divided at gaps": begins.sum(), "rows are added in gaps": np.sum(rows < 0),
               "tracks of fewer than three rows are left out": len(np.unique(track)) - len(np.unique(splines.track))}
     for what, count in counts.items():
         if count:
             log.info("%s: %d %s", file, count, what)
     return Tracks(np.rint(splines.time[order] / interval) * interval, splines.track[order], splines.position[order],
-                  splines.velocity[order], None if found.density is None else found.density[rows]), noise
+                  splines.velocity[order], None if found.density is None else found.density[rows]), noise, errors
 
 
 def _continuous(found: Tracks, edge: float, noise: float) -> bool:
@@ -297,19 +309,20 @@ def _rounding(times: np.ndarray, interval: float) -> float:
     return next((unit for unit in units if np.abs(times / unit - np.rint(times / unit)).max() < SAME), 0.0)
 
 
-def _region(found: Tracks, settings: Settings) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the lower and upper corner of the measured volume or the periodic box, in the coordinates of the file, and
-    the edge of the periodic cube.
+def _region(found: Tracks, settings: Settings) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+    """Return the lower and upper corner of the measured volume or the periodic box, in the coordinates of the file, the
+    edge of the periodic cube, and the numbers (3,) of periods in it.
 
     A measured volume that is not periodic lies in the middle of a larger cube, at least [tracks] margin away from its
-    periodic images.
+    periodic images. Along a short edge of the volume there is room for several images, so the flow has a shorter period
+    and fewer modes. For filtered tracks, of which solves were no faster and less accurate, it has one period.
     """
     if settings.volume is None:
         edge = settings.box if settings.box is not None else found.edge
         if edge is None:
             raise SceneError("[tracks] box: this key is missing, and the file has no periodic cubic box; give "
                              'the edge of the periodic cube, or the volume of the measurement, such as volume = "auto"')
-        return np.zeros(3), np.full(3, edge), edge
+        return np.zeros(3), np.full(3, edge), edge, np.ones(3, int)
     if settings.volume == "auto":
         lower, upper = found.position.min(0), found.position.max(0)
         log.info("%s: volume = [%s]", settings.file, ", ".join(f"{x:.6g}" for x in np.ravel([lower, upper], "F")))
@@ -323,7 +336,9 @@ def _region(found: Tracks, settings: Settings) -> tuple[np.ndarray, np.ndarray, 
     if edges.min() < FLAT * spacing:
         raise SceneError(_flat(settings, edges, count))
     margin = MARGIN * spacing if settings.margin is None else settings.margin
-    return lower, upper, float(edges.max()) + margin
+    edge = float(edges.max()) + margin
+    periods = np.ones(3) if settings.filtered else np.floor(edge / (edges + margin) * (1 + EQUAL))
+    return lower, upper, edge, periods.astype(int)
 
 
 def _flat(settings: Settings, edges: np.ndarray, count: float) -> str:
