@@ -259,13 +259,6 @@ def test_what_cannot_end_is_refused_before_it_begins(comm, tmp_path, monkeypatch
         assert (output == "") == (command == "run") and list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.mpi(2)
-def test_a_refusal_is_written_once(comm, tmp_path, capfd):
-    assert run_cli("run", TINY, "--set", "time.step=1e-12", "--output", tmp_path / "run") == 2
-    errors = capfd.readouterr().err
-    assert errors.count("\n") == (comm.rank == 0) and not (tmp_path / "run").exists()
-
-
 @pytest.mark.mpi(1)
 def test_only_the_stages_that_are_asked_for_are_refused(comm, tmp_path):
     scene = load_scene(TINY, ["simulation.step=1e-12", "tracers.turnovers=0.01"])

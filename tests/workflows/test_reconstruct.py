@@ -172,7 +172,7 @@ def test_quantities_at_given_points_are_those_of_the_field(comm, flow, tmp_path,
 
 @pytest.mark.mpi(2)
 @pytest.mark.parametrize("text, words", [
-    (None, "points.csv: cannot be read: No such file"), ("x,y\n1,2,3\n", "points.csv: cannot be read as a table of"),
+    (None, "points.csv: cannot be read: No such file"),
     ("time,x,y,z\n0,1,1,1\n99,1,2,3\n", r"points.csv: .1, 2, 3, 99. is outside .* times from 0 to 0.*1 such")])
 def test_points_that_cannot_be_used_are_refused_on_all_ranks(comm, flow, tmp_path, linked, text, words):
     scene, folder = flow
