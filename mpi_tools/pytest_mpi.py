@@ -15,6 +15,7 @@ start mpirun from a process that has initialised it.
 import faulthandler
 import gc
 import os
+import re
 import signal
 import sys
 
@@ -67,6 +68,13 @@ class Rank:
     def tmp_path(self, tmp_path):
         """The folder `tmp_path` of rank 0."""
         return self._comm.bcast(tmp_path)
+
+    def pytest_ignore_collect(self, collection_path):
+        """A file without a test for this number of ranks is not even imported."""
+        if collection_path.name.startswith("test_") and collection_path.suffix == ".py":
+            marks = re.findall(r"mark\.mpi\(([\d, ]*)", collection_path.read_text(encoding="utf-8"))
+            return None if any(str(self._comm.size) in mark.split(", ") for mark in marks) else True
+        return None
 
     def pytest_collection_modifyitems(self, config, items):
         def is_chosen(item):

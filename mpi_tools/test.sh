@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Sets up what is missing and runs the tests: those without MPI beside those on one rank, then those on two and on three.
+# Sets up what is missing and runs the tests: those on one and on two ranks, beside those without MPI and on three.
 # Arguments go to each pytest: bash mpi_tools/test.sh tests/parallel -k halo
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -14,17 +14,29 @@ export OMPI_MCA_pml=${OMPI_MCA_pml:-ob1} OMPI_MCA_ess_singleton_isolated=1
 unset PYTHONDONTWRITEBYTECODE
 failed=0
 log=$(mktemp)
-# The tests send signals to jobs, which would inherit that they are ignored: in the background, or under nohup.
-env --default-signal=INT,HUP .venv/bin/python -m pytest "$@" > "$log" 2>&1 &
-unmarked=$!
-trap 'kill $unmarked 2> /dev/null || true; rm "$log"' EXIT
-for ranks in 1 2 3; do
-    echo "tests on $ranks rank(s)"
-    .venv/bin/python mpi_tools/launch.py -n $ranks -- .venv/bin/python -m pytest --color=no -m mpi "$@" || failed=1
-    if [ $ranks -eq 1 ]; then
-        wait $unmarked || [ $? -eq 5 ] || failed=1  # 5: no tests are selected
-        echo "tests without MPI"
-        cat "$log"
-    fi
-done
+
+# The tests on a number of ranks.
+on_ranks() {
+    echo "tests on $1 rank(s)"
+    .venv/bin/python mpi_tools/launch.py -n "$1" -- .venv/bin/python -m pytest --color=no -m mpi "${@:2}"
+}
+
+# The tests without MPI, then those on three ranks, which are few.
+beside() {
+    local failed=0
+    echo "tests without MPI"
+    # The tests send signals to jobs, which would inherit that they are ignored: in the background, or under nohup.
+    env --default-signal=INT,HUP .venv/bin/python -m pytest "$@" || [ $? -eq 5 ] || failed=1  # 5: none is selected
+    on_ranks 3 "$@" || failed=1
+    return $failed
+}
+
+set -m  # a process group for the background
+beside "$@" > "$log" 2>&1 &
+others=$!
+trap 'kill -- -$others 2> /dev/null || true; rm "$log"' EXIT
+on_ranks 1 "$@" || failed=1
+on_ranks 2 "$@" || failed=1
+wait $others || failed=1
+cat "$log"
 exit $failed

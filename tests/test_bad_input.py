@@ -80,7 +80,7 @@ PATHS = [
     (["export", "."], ".: has no fields or particles"), (["report", "."], ".: holds none of ground_truth.h5")]
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_paths(comm, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     for command, message in PATHS:

@@ -89,7 +89,7 @@ def test_a_pair_term_of_the_users(example):
     assert learned.shape == (20, 5) and 0 < np.abs(learned - start).max() < 0.5
 
 
-@pytest.mark.mpi(2)
+@pytest.mark.mpi(1)
 def test_a_network_of_the_users(example):
     run = example("own_network")
     _, terms, weights = results(run)

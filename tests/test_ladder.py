@@ -31,7 +31,7 @@ def rates_of(slab, particles, model):
     return {name: by_id(slab.comm, particles, rate, COUNT) for name, rate in found.items()}
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 @pytest.mark.parametrize("name", RUNGS)
 def test_rates_of_a_rung_do_not_depend_on_the_ranks(comm, name):
     columns, model = state(COUNT), rung(comm, name)

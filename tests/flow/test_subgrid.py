@@ -112,7 +112,7 @@ def developed(grid):
     return march(IncompressibleFluid(grid, 0.02), initial_fields.random_velocity(grid, 5, 1.0, 2.0), 0.06, 20)
 
 
-@pytest.mark.mpi(2)
+@pytest.mark.mpi(1)
 @DYNAMIC
 def test_a_dynamic_coefficient_follows_the_way_that_energy_goes(grid, velocity, developed, width, with_gradient):
     """It is positive where energy goes to smaller scales. It is 0 in the same flow run backwards, in random modes,

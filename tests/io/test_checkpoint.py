@@ -62,7 +62,7 @@ def test_what_is_read_is_what_was_written(comm, tmp_path):
     assert saved.read("nothing").shape == (0, 2)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_the_newest_three_are_kept(comm, tmp_path):
     directory = fill(comm, tmp_path, [1, 2, 3, 10, 11])
     assert sorted(path.name for path in directory.path.iterdir()) == [f"step-{n:08d}.h5" for n in (3, 10, 11)]
@@ -72,7 +72,7 @@ def test_the_newest_three_are_kept(comm, tmp_path):
     assert not directory.path.exists()
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_checkpoint_of_other_settings_or_with_damage_is_replaced(comm, tmp_path):
     """The present state must not be lost. A checkpoint of this step and these settings holds it, and is kept."""
     fill(comm, tmp_path, [5], "others")
@@ -87,7 +87,7 @@ def test_a_checkpoint_of_other_settings_or_with_damage_is_replaced(comm, tmp_pat
     assert fill(comm, tmp_path, [5]).newest()["time"] == 5 / 3
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_which_checkpoints_are_used(comm, tmp_path, caplog, monkeypatch):
     """Checkpoints of other kernels are used with a warning. Leftovers, other names, and those of other settings and
     versions are removed."""
@@ -119,7 +119,7 @@ def test_which_checkpoints_are_used(comm, tmp_path, caplog, monkeypatch):
     assert comm.rank > 0 or "step-00000001.h5: was made by another version" in caplog.text
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 @pytest.mark.parametrize("name, rank", [("step-00000002.h5", 0), ("frames-00000000.h5", -1)])
 def test_what_the_system_refuses_to_read_is_kept(comm, tmp_path, monkeypatch, name, rank):
     """It may be sound. All ranks raise, also if only the last one cannot read the file."""
@@ -168,7 +168,7 @@ def harm(path, kind, chooser):
     return f"{kind} at {at} of {path}"
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_damage_is_found_and_the_checkpoint_before_is_used(comm, tmp_path, caplog):
     """Also damage of the frames that belong to it, and sound frames of another run."""
     path, chooser = tmp_path / "checkpoints", random.Random(comm.size)
@@ -195,7 +195,7 @@ def test_damage_is_found_and_the_checkpoint_before_is_used(comm, tmp_path, caplo
         assert comm.rank > 0 or re.search(f"{name}: .*not used", caplog.text), harmed
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_full_disk_keeps_the_earlier_checkpoints(comm, tmp_path):
     """The last rank meets the limit."""
     directory = fill(comm, tmp_path, [1])
@@ -208,7 +208,7 @@ def test_a_full_disk_keeps_the_earlier_checkpoints(comm, tmp_path):
     assert directory.newest().content["step"] == 2
 
 
-@pytest.mark.mpi(1, 2, timeout=30)
+@pytest.mark.mpi(2, timeout=30)
 @pytest.mark.parametrize("act", [CheckpointDirectory.remove, CheckpointDirectory.newest,
                                  lambda directory: directory.write(4, {"time": 1.0})],
                          ids=["remove", "clean", "keep the newest"])
@@ -257,7 +257,7 @@ def test_a_kill_leaves_a_checkpoint(comm, tmp_path):
         assert np.all(saved.read("numbers") == saved.content["step"])
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_the_guard_writes_checkpoints_when_due_and_before_a_stop(comm, tmp_path):
     stop = StopRequest(comm, checkpoint_seconds=1e9)
     guard = Guard(comm, tmp_path / "checkpoints", "settings", stop, " of the test")

@@ -52,7 +52,7 @@ def harm(comm, path, at):
     comm.Barrier()
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_reader_of_a_frame_is_told_of_its_bytes_alone(comm, path):
     whole = slice(None), slice(None)
     harm(comm, path, place_of(path, 2) + 100)
@@ -114,7 +114,7 @@ def test_no_changed_bit_gives_a_wrong_value(comm, tmp_path):
     assert found > 110
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_large_weights_are_checked(comm, tmp_path):
     many, path = np.random.default_rng(1).random(300_000), tmp_path / "model.h5"
     save_weights(comm, path, "model", {}, {"many": many}, {})

@@ -40,7 +40,7 @@ def test_table_attributes_and_provenance(comm, tmp_path):
     assert not (tmp_path / "a.h5.partial").exists()
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_an_exception_leaves_the_old_product_or_none(comm, tmp_path):
     write(comm, tmp_path / "a.h5")
     for name in ("a.h5", "b.h5"):
@@ -51,7 +51,7 @@ def test_an_exception_leaves_the_old_product_or_none(comm, tmp_path):
     assert product_fingerprint(tmp_path / "a.h5") == "abc" and not (tmp_path / "b.h5").exists()
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_unfinished_product_is_refused(comm, tmp_path):
     unfinished = tmp_path / "unfinished.h5"
     if comm.rank == 0:
@@ -106,7 +106,7 @@ def test_chunks_hold_at_most_a_mebibyte(comm, tmp_path):
             assert np.prod(dataset.chunks) * dataset.dtype.itemsize <= CHUNK_BYTES
 
 
-@pytest.mark.mpi(1, 2, timeout=30)
+@pytest.mark.mpi(2, timeout=30)
 def test_all_ranks_raise_if_rank_0_cannot_write(comm, tmp_path, monkeypatch):
     first_rank(comm, (tmp_path / "a.h5/something").mkdir, parents=True)
     with pytest.raises(WriteError, match="a.h5: Is a directory"):

@@ -62,7 +62,7 @@ def test_a_full_disk_is_told_and_harms_nothing(comm, tmp_path):
         assert np.all(file["particles/model/position/value"][3] == 3)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 @pytest.mark.parametrize("shape, frames", [((5,), 200), ((400000, 3), 2)])
 def test_hdf5_stays_within_the_reserved_space(comm, tmp_path, monkeypatch, shape, frames):
     """HDF5 never uses half of the margin. What it does not need is cut off."""
@@ -82,7 +82,7 @@ def test_hdf5_stays_within_the_reserved_space(comm, tmp_path, monkeypatch, shape
         assert size == file.id.get_filesize() and file["values"].shape[0] == frames
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_file_is_forced_to_the_disk_before_it_gets_its_name(comm, tmp_path, monkeypatch):
     """By every rank, which may be on another node; then the name is, by rank 0."""
     done, fsync, replace, folder = [], os.fsync, os.replace, tmp_path.resolve()
@@ -192,7 +192,7 @@ def test_a_file_that_was_left_open_does_not_harm_the_next_one(tmp_path):
         assert np.all(file["values"][:] == 2.0)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_failing_close_does_not_hide_the_error(comm, tmp_path, monkeypatch):
     """The last rank alone meets it; all keep the file until the process ends."""
     abandoned, close = [], new_files._NewFile.close
@@ -252,7 +252,7 @@ def test_several_ranks_need_an_h5py_with_mpi(comm, tmp_path, capfd, monkeypatch)
         assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_small_files_are_all_written_or_none(comm, tmp_path):
     page, data = tmp_path / "page.html", tmp_path / "metrics.json"
     in_files(comm, tmp_path, lambda: write_files({page: "ä", data: b"\0\1"}))

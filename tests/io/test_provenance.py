@@ -17,7 +17,7 @@ def write(comm, directory, kind, *made_from):
         return read_provenance(file)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_product_has_an_id_of_its_own_and_those_of_what_it_was_made_from(comm, tmp_path):
     truth = write(comm, tmp_path, "ground_truth")
     model = write(comm, tmp_path, "model", "ground_truth", "kernel")

@@ -21,7 +21,7 @@ def save(comm, path):
                  {"history": {"step": np.arange(4), "loss": np.ones(4)}})
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_weights_survive(comm, tmp_path):
     save(comm, tmp_path / "m.h5")
     stored = load_weights(comm, tmp_path / "m.h5", "model")
@@ -32,7 +32,7 @@ def test_weights_survive(comm, tmp_path):
     assert stored.tables.keys() == {"history"} and np.array_equal(stored.tables["history"]["step"], np.arange(4))
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_tensors_that_are_not_finite_are_neither_written_nor_read(comm, tmp_path, monkeypatch):
     tensors = {"scale": np.array([1.0, np.nan])}
     with pytest.raises(ProductError, match="m.h5: tensor scale is not finite"):

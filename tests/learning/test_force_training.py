@@ -166,7 +166,7 @@ def test_terms_read_the_density_that_is_given(comm):
     assert torch.allclose(same, own, rtol=0, atol=1e-12) and not torch.allclose(other, own, rtol=0, atol=1e-3)
 
 
-@pytest.mark.mpi(2)
+@pytest.mark.mpi(1)
 def test_the_loss_of_the_power_corrects_the_attenuation_by_noise(comm):
     """A drag of rate 0.3, fitted to the acceleration with a noisy velocity, takes out too little energy."""
     rates = {}

@@ -83,15 +83,23 @@ def test_exit_code_is_that_of_the_ranks_and_a_refusal_is_one_line(arguments, cod
 
 
 def test_doctor_names_what_is_missing_and_leaves_no_file(tmp_path):
-    result = python(*launched(2, CHECKOUT / "mpi_tools/doctor.py"), cwd=tmp_path)
+    modules, work = tmp_path / "modules", tmp_path / "work"
+    modules.mkdir()
+    work.mkdir()
+    # These take long to import.
+    (modules / "matplotlib.py").write_text("__version__ = '1'\n")
+    (modules / "torch.py").write_text("from types import SimpleNamespace\n__version__ = '1'\n"
+                                      "get_num_threads = lambda: 1\n"
+                                      "cuda = SimpleNamespace(is_available=lambda: False)\n")
+    code = (f"import os, sys, runpy; sys.path.insert(0, {str(modules)!r}); {{}}; "
+            f"runpy.run_path({str(CHECKOUT / 'mpi_tools/doctor.py')!r}, run_name='__main__')")
+    result = python(*launched(2, "-c", code.format("pass")), cwd=work)
     assert result.returncode == 0, result.stdout + result.stderr
     assert "rank 0 of 2" in result.stdout and "rank 1 of 2" in result.stdout and "mpio" in result.stdout
-    assert not list(tmp_path.iterdir())
-    for name in ("pyfftw", "torch", "matplotlib"):  # the last two take long to import
-        (tmp_path / f"{name}.py").write_text("raise ImportError('made up')")
+    for name in ("pyfftw", "torch", "matplotlib"):
+        (modules / f"{name}.py").write_text("raise ImportError('made up')")
     # A third rank that MPI does not connect.
-    code = (f"import os, sys, runpy; sys.path.insert(0, {str(tmp_path)!r}); os.environ['OMPI_COMM_WORLD_SIZE'] = '3'; "
-            f"runpy.run_path({str(CHECKOUT / 'mpi_tools/doctor.py')!r}, run_name='__main__')")
-    result = python(*launched(2, "-c", code), cwd=tmp_path)
+    result = python(*launched(2, "-c", code.format("os.environ['OMPI_COMM_WORLD_SIZE'] = '3'")), cwd=work)
+    assert not list(work.iterdir())
     assert result.returncode == 8  # four on each of two ranks
     assert "3 ranks were started" in result.stdout and "rank 1: pyfftw" in result.stdout

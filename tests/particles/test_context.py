@@ -28,7 +28,7 @@ def count_calls(monkeypatch, owner, name):
     return calls
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_terms_share_pairs_and_the_resolved_velocity(comm, monkeypatch):
     slab, particles = distributed(comm, *state())
     dynamics = dynamics_of(slab, model({**MODELS["resolved + pairs"], "eddy-viscosity": {}, "density-flux": {}}))
@@ -88,7 +88,7 @@ class WeightedMean(PairTerm):
         return Rates(density=(sums / context.moments.weight)[0])
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_density_is_summed_for_all_particles_if_rates_are_for_some(comm):
     """Density and rates of some particles both need moments."""
     slab, particles = distributed(comm, *state())

@@ -60,7 +60,7 @@ def assert_honest(shares):
     assert ((0.88 < shares[:, 1]) & (shares[:, 1] < 0.98)).all(), shares
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(1)
 @pytest.mark.parametrize("prior, noise", [(1.0, 1.0), (0.5, 2.0), (4.0, 0.3)])
 def test_errors_are_within_their_standard_deviations_whatever_the_penalty_assumes(comm, prior, noise):
     """The penalty assumes the same factor for the variances of flow and noise."""

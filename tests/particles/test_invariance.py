@@ -45,7 +45,7 @@ def acceleration(comm, name, *, rotation=None, shift=(0, 0, 0), wind=(0, 0, 0), 
     return found @ rotation * time**2
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(1)
 @pytest.mark.parametrize("name", NAMES)
 def test_a_boost_a_mirror_a_turn_and_a_shift_change_nothing(comm, name):
     """Rounding is multiplied by the condition of a neighbourhood in kriging, 1e5, and by forty times the velocity in
@@ -56,7 +56,7 @@ def test_a_boost_a_mirror_a_turn_and_a_shift_change_nothing(comm, name):
         assert relative(acceleration(comm, name, **changed), still) < 1e-9, changed
 
 
-@pytest.mark.mpi(2)
+@pytest.mark.mpi(1)
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("time", [1e-6, 1e6])
 def test_the_unit_of_time_changes_nothing(comm, name, time):
@@ -68,7 +68,7 @@ def test_the_unit_of_time_changes_nothing(comm, name, time):
     assert relative(acceleration(comm, name, time=time, precision=torch.float32), still) < max(3 * single, 1e-4)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(1)
 def test_unevenly_seeded_particles_resolve_a_flow_that_moves(comm):
     """4096 particles in an ABC flow plus a wind, most of them where cos x is 1. The mean over the particles is off by
     0.4 rms velocities, which gives an error of 0.47."""

@@ -57,7 +57,7 @@ def test_gradient_and_laplacian_are_those_of_all_derivatives(comm):
     assert 0.2 * estimates.laplacian_bound[5] < -estimates.laplacian(spike)[5] < 0.6 * estimates.laplacian_bound[5]
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_estimates_are_linear_and_differentiable_in_the_field(comm):
     estimates, particles = kriging(comm, at(random_velocity(2), POSITION))
     field, direction = particles.velocity[:, 0].clone().requires_grad_(), particles.velocity[:, 1]

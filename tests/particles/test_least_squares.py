@@ -19,7 +19,7 @@ def equations_on(comm):
     return equations, grid.points(torch.from_numpy(position)), torch.from_numpy(random.standard_normal((300, 3)))
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(1, 3)
 def test_the_result_solves_the_equations(comm):
     equations, points, values = equations_on(comm)
     right = equations.gathered(values, points)

@@ -55,7 +55,7 @@ class LinearPairs(PairTerm):
         return Rates(acceleration=sums.T)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_stored_linear_terms_give_their_rates_and_gradients_at_any_parameters(comm):
     """For all particles and for some rows, with a user's sum over pairs and a network that reads the density."""
     slab, particles = distributed(comm, *state())
@@ -105,7 +105,7 @@ def test_a_term_that_is_not_linear_is_named(comm):
         quadratic.require_linear(dynamics_of(slab, quadratic).context(particles))
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_the_modes_of_a_force_are_those_of_its_acceleration(comm):
     """At the particles; also beside terms that read the density, and for some rows."""
     slab, particles = distributed(comm, *state())
@@ -210,7 +210,7 @@ class Learned(Term):
         return Rates(acceleration=self.acceleration(context, self.factor))
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_fault_that_shapes_do_not_show_is_found_before_training(comm):
     slab, particles = distributed(comm, *state())
     before = particles.velocity.clone()

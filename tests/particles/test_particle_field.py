@@ -134,7 +134,7 @@ def test_averages_replace_kriging_at_points_with_too_many_neighbours(comm, monke
         assert f"{int(replaced.sum())} of 500 points" in caplog.text
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_volumes_by_table_and_their_gradient(comm):
     """Volumes for one table after the other, and their gradient by the weights against a difference."""
     field = field_of(comm, torch.cos)

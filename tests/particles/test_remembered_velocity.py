@@ -43,7 +43,7 @@ def remembered(comm, planes=16, resolved=5, memory=16.0):
     return RememberedVelocity(ResolvedVelocity(grid, 1e-3, weight=1.0), VISCOSITY, torch.ones_like(grid.shell), memory)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(1)
 def test_a_forecast_is_the_exact_solution(comm):
     flow, still = remembered(comm), np.zeros(3)
     start, grid = exact(flow.solver.grid, 0.0, still), flow.solver.grid
@@ -59,7 +59,7 @@ def test_without_data_the_variance_of_the_prior_stays_that_of_the_flow(comm):
     assert torch.allclose(flow._next_penalty(torch.full_like(first, 0.7)), first, rtol=1e-12)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(1)
 def test_few_particles_tell_more_over_several_frames(comm):
     """30 particles, new ones in each frame, for 90 modes: one frame cannot determine them, ten can."""
     drift = np.array([0.3, -0.2, 0.1])

@@ -223,7 +223,7 @@ def test_opposite_forces_keep_the_momentum_of_particles_and_forces_of_the_grid_t
         assert force.sum(0).norm() <= 1e-13 * rates.acceleration.norm(dim=1).sum(), name
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_particles_may_cross_slabs_and_the_box_within_a_step(comm):
     """At 1000 c, by 0.2, 1.7 and 170 units of length; they change rank before each evaluation."""
     model, position = network_model("own density"), random_points()

@@ -32,7 +32,7 @@ def norm(comm, modes):
     return float(np.sqrt(global_sum(comm, np.sum(np.abs(modes) ** 2, dtype=float))))
 
 
-@pytest.mark.mpi(2)
+@pytest.mark.mpi(1)
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_taylor_green_energy(comm, stepper):
     # E(0.1) at Re = 1600 on 32^3, on which public spectral codes agree in all digits.
@@ -107,7 +107,7 @@ def test_a_wave_in_a_uniform_flow_grows_as_theory_says(comm, stepper, advection,
     assert measured_growth(comm, stepper, advection, viscosity, sound) == pytest.approx(theory, rel=1e-4)
 
 
-@pytest.mark.mpi(2)
+@pytest.mark.mpi(1)
 def test_mach_numbers_0_01_and_0_5_take_the_same_steps_and_keep_the_energy_budget(comm):
     steps = []
     for mach in (0.01, 0.5):
@@ -176,7 +176,7 @@ def test_single_precision_follows_double_precision(comm):
     assert 1e-8 < norm(comm, ends[0] - ends[1]) / norm(comm, ends[1]) < 2e-6
 
 
-@pytest.mark.mpi(2)
+@pytest.mark.mpi(1)
 @pytest.mark.parametrize("limit", list(TOO_LONG))
 def test_a_run_that_diverges_says_so_at_the_step_and_names_the_limit(comm, tmp_path, limit):
     name, overrides = TOO_LONG[limit]

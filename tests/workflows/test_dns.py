@@ -47,7 +47,7 @@ def table_of(comm, path, name="statistics"):
         return read_table(file, name)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(1)
 @pytest.mark.parametrize("interval", [1e-9, 1e-3])
 def test_short_intervals_after_a_long_spin_up_are_stored_at_their_times(comm, followed, interval):
     scene = load_scene("tracers-only", [*SMALL, "spin_up.turnovers=0.02", f"tracers.turnovers={interval}",
@@ -86,7 +86,7 @@ def test_tracers_are_stored_by_id_and_do_not_depend_on_ranks(comm, followed):
     comm.Barrier()
 
 
-@pytest.mark.mpi(2)
+@pytest.mark.mpi(1)
 def test_a_start_with_another_speed_of_sound_makes_no_sound(comm, followed):
     """The final state of a run is the start of the next. The compressible part of the energy stays that of the pressure
     that follows the flow, of order M_t^4."""
@@ -123,7 +123,7 @@ def test_a_flow_with_tracers_is_a_start_on_any_grid(comm, followed):
     assert 1e-6 < abs(finer[-1] / same[-1] - 1) < 0.05
 
 
-@pytest.mark.mpi(2)
+@pytest.mark.mpi(1)
 def test_statistics_are_sampled_every_few_steps_at_the_release_and_at_the_end(comm, followed):
     path = followed("run", load_scene(TINY, [*SMALL_TINY, "spin_up.turnovers=0.1", "spin_up.stationary=0.04",
                                              "tracers.turnovers=0.3", "time.step=0.01"]))
@@ -153,7 +153,7 @@ def test_the_stationary_span_is_the_last_turnovers_of_the_spin_up():
     assert span == {"start": 8.0, "end": 18.0}
 
 
-@pytest.mark.mpi(2)
+@pytest.mark.mpi(1)
 @pytest.mark.parametrize("name", [TINY, "tracers-only"], ids=["compressible", "incompressible"])
 def test_scales_are_those_of_the_release_however_long_the_flow_is_followed(comm, followed, name):
     overrides, scales = SMALL if name != TINY else [*SMALL_TINY, "spin_up.turnovers=0.05"], []
@@ -200,7 +200,7 @@ OWN = ["flow.cells=16", "time.duration=0.5", "time.step=0.05", "flow.fluid=own_f
        "initial.kind=own_flow:jet", "initial.wavenumber=2"]
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_fluid_and_a_start_of_the_users(comm, followed, own):
     own("own_flow", OWN_FLOW)
     scene = load_scene("taylor-green", OWN)

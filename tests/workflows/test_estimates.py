@@ -37,7 +37,7 @@ def test_the_step_and_the_key_that_limits_it(override, step, limit):
     assert (expected.step, expected.limited_by) == (pytest.approx(step), limit)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(1)
 def test_speeds_and_steps_are_those_of_the_flow_at_its_start(comm):
     from eddies.flow.statistics import component_energies
     from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
@@ -56,7 +56,7 @@ def test_speeds_and_steps_are_those_of_the_flow_at_its_start(comm):
             assert estimate(scene).step == pytest.approx(taken)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_flow_from_a_file_has_the_scales_steps_and_frames_of_its_run(comm, tmp_path):
     """The first run is the start of the second, which releases its tracers at once."""
     from eddies.workflows import dns
@@ -85,7 +85,7 @@ def test_a_flow_from_a_file_has_the_scales_steps_and_frames_of_its_run(comm, tmp
     assert expected.frames == frames and 1 <= expected.steps / steps < 1.3
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_what_is_unknown_is_none(comm, own):
     own("own_flow", "def swirl(grid, initial, seed): pass\n")
     inviscid = estimate(one_model("hit-small", ["flow.viscosity=0"]))
@@ -98,7 +98,7 @@ def test_what_is_unknown_is_none(comm, own):
     assert measured == {} and "nowhere.h5: no such file" in problem
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 @pytest.mark.parametrize("fluid", ["compressible", "incompressible"])
 def test_memory_of_a_step_is_as_expected(comm, fluid):
     """Arrays that a state, its operators and buffers hold, as counted by the allocator."""
@@ -137,7 +137,7 @@ def test_a_memory_of_an_unfiltered_flow_has_eight_times_the_grid_points():
     assert 4 < needs("memory", "false") / needs("memory", "true") <= 8  # less than 8, because of the particles
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_tracks_need_what_their_file_holds(comm, tmp_path):
     """A slab of measured tracks in a larger cube, half of them in all frames."""
     import numpy as np

@@ -76,7 +76,7 @@ def found_step(comm, scene, directory):
         return read_attributes(file, "found"), read_table(file, "trials/rk2")
 
 
-@pytest.mark.mpi(2)
+@pytest.mark.mpi(1)
 def test_the_step_is_the_longest_whose_half_changes_little_of_the_error(comm, small_products, linked, own_method):
     """The error of the method is a + b h, so that halving the step changes b h / 2. In a weaker flow the same error is
     a larger share, and the step must converge there too."""

@@ -4,7 +4,9 @@ import ctypes
 import functools
 import hashlib
 import os
+import sys
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 
@@ -73,6 +75,20 @@ def load(instruction_set: str) -> ctypes.CDLL:
 
 
 @functools.cache
+def import_pyfftw() -> ModuleType:
+    """Import pyfftw without its interface to scipy.fftpack, which takes a third of the time until a command begins."""
+    hidden = "scipy.fftpack" not in sys.modules
+    if hidden:
+        sys.modules["scipy.fftpack"] = None
+    try:
+        import pyfftw
+    finally:
+        if hidden:
+            del sys.modules["scipy.fftpack"]
+    return pyfftw
+
+
+@functools.cache
 def share_threads() -> None:
     """Make kernels, and torch if it is loaded later, use the OpenMP runtime of pyfftw's wheel.
 
@@ -82,7 +98,7 @@ def share_threads() -> None:
     maps = Path("/proc/self/maps")
     if threads() == 1 or not maps.exists():
         return
-    import pyfftw
+    pyfftw = import_pyfftw()
     runtimes = (line.split(maxsplit=5)[5] for line in maps.read_text().splitlines() if "/libgomp" in line)
     # The maps hold real paths, without links. Without a wheel, pyfftw uses the system's runtime, as all others do.
     of_wheel = Path(pyfftw.__file__).resolve().parents[1] / "pyfftw.libs"

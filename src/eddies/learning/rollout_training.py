@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
 from eddies.learning.losses import mean_square_share
 from eddies.learning.training import Adam, shared_values
@@ -127,14 +126,14 @@ class RolloutTrainer:
         # energies. In the backward pass the solve starts from the solution of the forward pass and takes no iteration.
         near: Tensor | None = None
 
-        def energies_of(position: Tensor, velocity: Tensor) -> Tensor:
+        def energies_of(position: Tensor, velocity: Tensor) -> tuple[Tensor]:
             nonlocal near
             moved = replace(particles, position=position, velocity=velocity)
             energies = self.resolution.band_energies(moved, near=near)
             near = self.resolution.latest
-            return energies
+            return energies,
 
-        energies = _recomputed(energies_of, particles.position, particles.velocity)
+        energies, = _recomputed(energies_of, particles.position, particles.velocity)
         true = window.energies[frame]
         return ((energies - true) / (true * self.units[frame])).square().mean() / self.comm.size
 
@@ -185,10 +184,6 @@ class RolloutTrainer:
             yield "density_loss", particles.density - true, true - window.particles.density
 
 
-# The wrapper of `checkpoint` loads torch's compiler, which takes two seconds.
-UNWRAPPED = getattr(checkpoint, "__wrapped__", checkpoint)
-
-
 def energy_units(windows: Sequence[TrainingWindow]) -> Tensor:
     """Return the relative error of the band energies of particles without acceleration: (frames, bands).
 
@@ -200,8 +195,35 @@ def energy_units(windows: Sequence[TrainingWindow]) -> Tensor:
     return torch.maximum(units, SLOWEST * units.amax(1, keepdim=True))
 
 
-def _recomputed(function: Callable[..., Any], *columns: Tensor) -> Any:
+class _Recomputed(torch.autograd.Function):
+    """function(*columns), a tuple, whose backward pass calls the function again and adds the gradients of parameters.
+
+    `torch.utils.checkpoint` does the same, but loads torch's compiler, which takes two seconds.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, function: Callable[..., tuple[Tensor, ...]], anchor: Tensor,
+                *columns: Tensor) -> tuple[Tensor, ...]:
+        """The `anchor` requires a gradient, so that the results do, even if only parameters have one."""
+        ctx.function = function
+        ctx.save_for_backward(*columns)
+        ctx.set_materialize_grads(False)
+        return function(*columns)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        columns = [column.detach().requires_grad_(column.requires_grad) for column in ctx.saved_tensors]
+        with torch.enable_grad():
+            results = ctx.function(*columns)
+        given = [(result, gradient) for result, gradient in zip(results, gradients)
+                 if gradient is not None and result.requires_grad]
+        if given:
+            torch.autograd.backward(*zip(*given))
+        return None, None, *(column.grad for column in columns)
+
+
+def _recomputed(function: Callable[..., tuple[Tensor, ...]], *columns: Tensor) -> tuple[Tensor, ...]:
     """Return function(*columns) without storing intermediate results: the backward pass calls the function again."""
     if not torch.is_grad_enabled():
         return function(*columns)
-    return UNWRAPPED(function, *columns, use_reentrant=False, preserve_rng_state=False)
+    return _Recomputed.apply(function, torch.zeros((), requires_grad=True), *columns)

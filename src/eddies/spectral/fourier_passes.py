@@ -12,10 +12,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import pyfftw
 
 from eddies.cores import threads
 from eddies.kernels.copies import Blocks, ColumnCopies, Described, PlaneCopies
+from eddies.kernels.library import import_pyfftw
+
+pyfftw = import_pyfftw()
 
 BLOCK_BYTES = 2**18  # size of a block per component and thread: a few blocks fit the second-level cache of a core
 CACHE_LINE = 64

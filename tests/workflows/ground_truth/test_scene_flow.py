@@ -78,7 +78,7 @@ def path(comm, tmp_path):
     return comm.bcast(str(tmp_path / "start.h5"))
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 @pytest.mark.parametrize("layout, tolerance", [("cutout", 1e-6), ("new cutout", 1e-6), ("fluidsim", 1e-14),
                                                ("new fluidsim", 1e-14)])
 def test_the_flow_of_the_file_is_the_flow_of_the_scene(comm, path, caplog, layout, tolerance):
@@ -193,7 +193,7 @@ def test_an_unfit_file_is_refused_by_check_and_run(comm, path):
         comm.Barrier()
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_flow_starts_from_a_spectrum_in_a_text_file(comm, tmp_path):
     path = tmp_path / "spectrum.txt"
     scene = ["flow.cells=16", "initial.kind=spectrum", f"initial.path={path}"]

@@ -50,7 +50,7 @@ def saved(comm, directory, of=None, change=lambda weights: weights):
     return of, model, directory / "model.h5"
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_model_is_read_as_it_was_saved_for_the_scales_of_another_flow(comm, tmp_path):
     of, model, path = saved(comm, tmp_path)
     other = replace(SCALES, velocity=3.0, sound_speed=5.0, spacing=2 * SCALES.spacing,
@@ -206,7 +206,7 @@ def test_a_kernel_with_a_form_of_an_earlier_version_is_refused(comm, tmp_path):
         load_form(comm, tmp_path / "kernel.h5", SCALES)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_another_form_of_reconstruction_keeps_weights_and_id(comm, tmp_path):
     """A change of [kernel] form trains nothing, and products made with the kernel stay valid."""
     path = Path(comm.bcast(str(tmp_path))) / "kernel.h5"

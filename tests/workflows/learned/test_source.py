@@ -61,7 +61,7 @@ def write_source(comm, directory, description=None):
                  {"mach_turbulent": 0.08}, {"a_priori": {"delay": np.arange(2.0)}})
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_run_directory_or_its_file_gives_description_weights_and_tables(comm, tmp_path):
     write_source(comm, tmp_path)
     for path in (tmp_path, tmp_path / "model.h5"):
@@ -116,7 +116,7 @@ def test_missing_weights_are_refused_before_any_work_on_all_ranks(comm, tmp_path
     check_inputs(Step(wanted, ("dns",), tmp_path), comm)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_file_never_has_a_class_imported(comm, tmp_path, own):
     """The scene must name the class again, and one error says so."""
     first_rank(comm, own, "own_source", OWN_TERM)

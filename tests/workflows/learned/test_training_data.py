@@ -167,7 +167,7 @@ def test_the_same_is_learned_of_the_same_flow_in_other_units(comm, tmp_path, qui
     assert seen["a_priori"]["delay"].max() < 0 < unseen["a_priori"]["delay"].min()
 
 
-@pytest.mark.mpi(2)
+@pytest.mark.mpi(1)
 def test_a_forced_truth_is_matched_only_with_its_forcing(comm, tmp_path):
     """Known forces, none of which is learned, match the truth if the forcing has the power in its file."""
     scene = made(comm, tmp_path, "tracers.forced=true", "tracers.particles_per_side=10",
@@ -187,7 +187,7 @@ def test_a_forced_truth_is_matched_only_with_its_forcing(comm, tmp_path):
 
 
 @pytest.mark.mpi(1)
-def test_flows_have_their_own_forcing_and_share_the_parameters(comm, tmp_path):
+def test_flows_have_their_own_forcing_and_share_the_parameters(comm, tmp_path, quick_solves):
     free = made(comm, tmp_path)
     forced = scene_of(tmp_path, "tracers.forced=true", "forcing.injection_rate=0.7", "seed=4")
     (tmp_path / "forced").mkdir()

@@ -102,7 +102,7 @@ def test_the_rollout_is_the_same_on_any_number_of_ranks(comm, small_products, li
         assert np.array_equal(share, tables_alone["outside_training"]["share"]) and share.max() > 0
 
 
-@pytest.mark.mpi(2)
+@pytest.mark.mpi(1)
 def test_frames_between_steps_of_free_particles_lie_on_straight_lines(comm, small_products, linked):
     scene, directory = small_products[0], linked(small_products[1])
     for step in (0.03, 0.1):
@@ -119,8 +119,9 @@ def test_frames_between_steps_of_free_particles_lie_on_straight_lines(comm, smal
 
 @pytest.mark.mpi(1)
 def test_frames_of_long_steps_are_those_of_short_ones(comm, small_products, linked, monkeypatch):
+    tolerance = 1e-6  # the error of a step of 0.03 is 5e-5
     for name in ("tolerance", "tolerance_predicted"):
-        monkeypatch.setattr(ResolvedVelocity, name, 1e-8)
+        monkeypatch.setattr(ResolvedVelocity, name, tolerance)
     scene, directory, found = small_products[0], linked(small_products[1]), {}
     for step in (0.02, 0.03, 0.1):
         attributes, tables, found[step] = rolled_out(comm, directory, scene, step=step, precision="float64")
@@ -130,7 +131,7 @@ def test_frames_of_long_steps_are_those_of_short_ones(comm, small_products, link
         between = [abs(time / step - round(time / step)) > 1e-9 for time in 0.04 * np.arange(4)]
         closure = tables["closure"]
         assert np.array_equal(closure["solves"], [1, *3 * np.diff(reached)] + np.array(between))
-        assert (closure["most_iterations"] <= closure["iterations"]).all() and closure["residual"].max() < 1e-8
+        assert (closure["most_iterations"] <= closure["iterations"]).all() and closure["residual"].max() < tolerance
         assert not closure["not_converged"].any()
     short = found[0.02]
     for step in (0.03, 0.1):
@@ -152,7 +153,7 @@ def test_steps_are_as_short_as_the_resolved_velocity_needs(comm, small_products,
     assert attributes["time_step"] * highest * columns["velocity"][0].std() == pytest.approx(0.05, rel=0.2)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_steps_follow_the_present_flow_if_a_term_asks_for_it(comm, small_products):
     """In a flow with a quarter of the velocity the noise of single particles bears four times the step. The mean
     velocity has no effect."""
@@ -193,7 +194,7 @@ def test_a_rollout_that_goes_wrong_ends_there_and_keeps_its_frames(comm, small_p
 
 
 @pytest.mark.usefixtures("no_figures", "quick_solves")
-@pytest.mark.mpi(2)
+@pytest.mark.mpi(1)
 @pytest.mark.parametrize("fluid, model, weights, removals", [
     ("compressible", '[model]\npreset = "paper"\n[model.pairs]\nhidden = [4]\n[model.density-flux]\nhidden = [4]', 10,
      []),
