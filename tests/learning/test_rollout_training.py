@@ -170,7 +170,7 @@ def test_without_a_weight_windows_need_no_energies(comm):
 @pytest.mark.mpi(1)
 def test_the_energies_count_in_units_of_the_error_without_acceleration(comm):
     window = (trainer := trainer_of(comm)[0]).windows[0]
-    assert float(trainer._energy_share(window, 1, window.particles)) == pytest.approx(1, rel=1e-9)
+    assert float(trainer._energy_share(window, 1, window.particles).detach()) == pytest.approx(1, rel=1e-9)
     # Bands by columns. The error of the first is below a tenth of that of the second in the first frame.
     one, other = (replace(window, energies=torch.ones(2, 2), unforced=torch.tensor(unforced))
                   for unforced in ([[1.0, 2.0], [1.5, 1.0]], [[1.01, 1.0], [1.5, 3.0]]))

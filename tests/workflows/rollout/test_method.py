@@ -119,7 +119,7 @@ def test_frames_between_steps_of_free_particles_lie_on_straight_lines(comm, smal
 
 @pytest.mark.mpi(1)
 def test_frames_of_long_steps_are_those_of_short_ones(comm, small_products, linked, monkeypatch):
-    tolerance = 1e-6  # the error of a step of 0.03 is 5e-5
+    tolerance = 1e-7
     for name in ("tolerance", "tolerance_predicted"):
         monkeypatch.setattr(ResolvedVelocity, name, tolerance)
     scene, directory, found = small_products[0], linked(small_products[1]), {}
