@@ -98,8 +98,9 @@ class Rank:
     def pytest_runtest_logreport(self, report):
         if report.failed and self._comm.size > 1:
             captured = [f"--- {title} ---\n{text}" for title, text in report.sections]
-            print(f"\nrank {self._comm.rank} of {self._comm.size}: {report.nodeid} failed in {report.when}",
-                  report.longreprtext, *captured, sep="\n", file=sys.stderr, flush=True)
+            lines = [f"\nrank {self._comm.rank} of {self._comm.size}: {report.nodeid} failed in {report.when}",
+                     report.longreprtext, *captured, ""]
+            os.write(2, "\n".join(lines).encode())  # at once, so that no message of mpirun stands between
             self._comm.Abort(1)
 
     pytest_collectreport = pytest_runtest_logreport
