@@ -139,7 +139,7 @@ def main(run: Path, timed: bool) -> None:
     print("|---" * (3 + len(SHOWN)) + "|")
     for name, row in found.items():
         seconds = f"{row['seconds']:.2g}" if row.get("seconds", math.nan) > 0 else ""
-        training = f"{row['training_seconds']:.2g}" if row.get("training_seconds") else ""
+        training = f"{float(format(row['training_seconds'], '.2g')):g}" if row.get("training_seconds") else ""
         cells = (cell(row["tests"], key) for key in SHOWN)
         print(f"| `{name}` | {seconds} | {training} | {' | '.join(cells)} |")
 
