@@ -61,7 +61,7 @@ def test_adam_takes_the_same_steps_on_any_number_of_ranks(comm):
         unused = torch.nn.Parameter(torch.ones(1, dtype=torch.float64))
         optimizer = Adam(communicator, [parameter, unused], 10, 0.1, 0.01)
         norms = [optimizer.step(mean_square_share(parameter - torch.from_numpy(rows), 1.0, 60)) for _ in range(10)]
-        assert float(unused) == 1 and optimizer.learning_rate == pytest.approx(0.01 * 0.1 ** (1 / 9))
+        assert float(unused.detach()) == 1 and optimizer.learning_rate == pytest.approx(0.01 * 0.1 ** (1 / 9))
         return parameter.detach().numpy(), norms
 
     (found, norms), (alone, norms_alone) = fit(my_share(comm, target), comm), fit(target, MPI.COMM_SELF)
