@@ -270,7 +270,7 @@ def test_a_second_signal_ends_the_process(number):
     assert ended.returncode == -number and ended.stdout == f"[{int(number)}]\n"
 
 
-@pytest.mark.mpi(2)
+@pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("scene, changes, message", [
     ("taylor-green", ["time.step=1.0", "time.duration=100", "flow.viscosity=0"], "unstable at step"),
     ("taylor-green", ["forcing.injection_rate=0.5", "forcing.wavenumber=1.5"],

@@ -62,7 +62,7 @@ def test_the_force_is_that_of_the_sixty_nearest(comm):
 
 @pytest.mark.mpi(1, 2)
 def test_noise_of_the_training_belongs_to_the_particle(comm):
-    """It does not depend on the ranks, is drawn anew at each evaluation, and vanishes without gradients."""
+    """It does not depend on the ranks, differs at each evaluation, and vanishes without gradients."""
     columns, model, same = state(COUNT), rung(comm, "noise"), rung(comm, "noise")
 
     def accelerations(placed, noisy):

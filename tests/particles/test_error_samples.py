@@ -105,6 +105,20 @@ def test_errors_of_splines_are_those_of_the_frame(comm):
     assert not_told[0, 0] < 0.6 < told[0, 0]
 
 
+@pytest.mark.mpi(1)
+def test_the_noise_of_splines_is_that_of_the_frame(comm):
+    """The levels are measured in a frame with a third of the noise."""
+    solver = solver_on(comm)
+    flow, samples = flow_of(solver, 0, 1e-2), ErrorSamples(solver, 16)
+    samples.measure(velocities_of(solver, flow, 0.05), 0.05)
+    particles = velocities_of(solver, flow, 0.15)
+    modes = solver.of(particles).modes
+    own, other = (shares_within(solver.grid, modes - flow, list(samples.of(particles, modes, 1, noise)))
+                  for noise in (0.15, 0.05))
+    assert_honest(own)
+    assert (other < own).all()
+
+
 @pytest.mark.mpi(2, 3)
 def test_samples_do_not_depend_on_the_number_of_ranks(comm):
     alone, found = comm.Split(comm.rank), []

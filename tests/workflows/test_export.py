@@ -49,7 +49,7 @@ def compare(path, group, source):
             assert np.array_equal(velocity[:, :-1, :-1, :-1], field)
 
 
-@pytest.mark.mpi(2)
+@pytest.mark.mpi(1, 2)
 def test_every_series_of_a_run(comm, tmp_path):
     """Stored and computed ones, with density on one rank; a second export replaces the first."""
     density = comm.size == 1
