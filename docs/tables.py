@@ -1,15 +1,17 @@
-"""Writes the tables of README and docs, and results/steps.csv, from the results beside this file.
+"""Writes the tables of README and docs, results/steps.csv and ladder/choices.csv, from the results beside this file.
 
     .venv/bin/python docs/tables.py
 
 A table stands between two comments. The first names the comparison in docs/results, the columns, and the rows with the
-words for them; a row `floor` is the truth's own, and a row `simulation` has the cost of the direct simulation. A row
-`heads` first gives the head of the words; words of several cells are separated by ` | `:
+words for them; a row `floor` is the truth's own, and a row `simulation` has the cost of the direct simulation. Without
+rows the table has all of the comparison. A row OTHER/NAME is that of another comparison. A row `heads` first gives the
+head of the words; words of several cells are separated by ` | `:
 
     <!-- table of compare-small: wall_seconds velocity_error_half
     heads: model | needs
     learned: the default | pairs
     floor: two samples of the true particles |
+    other/learned: the same of `other` | pairs
     -->
     <!-- end of table -->
 
@@ -34,15 +36,19 @@ from eddies.measures import MEASURES
 
 HERE = Path(__file__).parent
 PAGES = (HERE.parent / "README.md", *sorted(HERE.glob("*.md")))
-TABLE = re.compile(r"(<!-- table of ([\w-]+): ([^\n]*)\n(.*?)-->\n).*?(?=<!-- end of table -->)", re.DOTALL)
+TABLE = re.compile(r"(<!-- table of ([\w.-]+): ([^\n]*)\n(.*?)-->\n).*?(?=<!-- end of table -->)", re.DOTALL)
 NUMBERS = re.compile(r"(<!-- numbers of ([\w-]+)\n(.*?)-->\n).*?(?=<!-- end of numbers -->)", re.DOTALL)
-WORDS = MEASURES | {"wall_seconds": "seconds a turnover", "core_seconds": "core seconds a turnover",
+WORDS = MEASURES | {"acceleration_error": "acceleration error", "spectrum_error": "spectrum error",
+                    "count_variance": "variance of counts", "plane_difference": "error of a plane", "wall_seconds": "seconds a turnover", "core_seconds": "core seconds a turnover",
                     "training_seconds": "training (s)",
                     "time_step": "step",
                     "step_integrator": "integrator", "step_size": "step", "step_seconds": "search (s)",
                     "step_error_twice": "error with twice the step", "step_error": "error",
                     "step_error_half": "with half"}
 HEADS, FLOOR, SIMULATION, UNMEASURED = "heads", "floor", "simulation", "unmeasured"
+# The choices that the paper leaves open: the file has the words, and these columns of results.
+CHOICES = HERE / "ladder" / "choices.csv"
+CHOICE_COLUMNS = "acceleration_error", "velocity_error_half", "velocity_error_end", "count_variance"
 # The steps that the search found: comparisons with their rows, and columns of the file.
 STEPS = HERE / "results" / "steps.csv"
 STEPS_OF = "hit-small", "compare-small", "compare-hit", "compare-coarse", "compare-256"
@@ -60,12 +66,14 @@ def table(comparison: str, columns: str, rows: str) -> str:
     """The lines of one table."""
     record = record_of(comparison)
     results, keys = {row["name"]: row for row in record["rows"]}, columns.split()
+    asked = [row.split(": ", 1) for row in rows.strip().splitlines()] or [(name, f"`{name}`") for name in results]
     # Any complete row has the floors, which are the truth's.
     results[FLOOR] = {key.removesuffix("_floor"): value for row in record["rows"] for key, value in row.items()
                       if key.endswith("_floor") and value is not None}
     results |= {SIMULATION: {"wall_seconds": record.get("simulation_seconds")}, UNMEASURED: {}}
-    asked = [row.split(": ", 1) for row in rows.strip().splitlines()]
     heads = f" {asked.pop(0)[1]} " if asked[0][0] == HEADS else " "
+    for other in {name.partition("/")[0] for name, _ in asked if "/" in name}:
+        results |= {f"{other}/{row['name']}": row for row in record_of(other)["rows"]}
     rule = "|---|" + "---|" * (heads.count("|") + len(keys))
     lines = [f"|{heads}|" + "".join(f" {WORDS[key]} |" for key in keys), rule]
     for name, words in asked:
@@ -75,12 +83,23 @@ def table(comparison: str, columns: str, rows: str) -> str:
 
 def steps() -> str:
     """The lines of the table of all steps."""
+    return as_csv([["scene", "variant", *(WORDS[key] for key in STEP_COLUMNS)],
+                   *([scene, row["name"], *(number(row, key) for key in STEP_COLUMNS)]
+                     for scene in STEPS_OF for row in record_of(scene)["rows"])])
+
+
+def choices() -> str:
+    """The lines of the table of choices. Its first three columns, variant and words, are those of the file."""
+    heads, *rows = csv.reader(CHOICES.read_text(encoding="utf-8").splitlines())
+    found = {row["name"]: row for row in record_of("choices")["rows"]}
+    return as_csv([[*heads[:3], *(WORDS[key] for key in CHOICE_COLUMNS)],
+                   *([*row[:3], *(number(found[row[0]], key) for key in CHOICE_COLUMNS)] for row in rows)])
+
+
+def as_csv(rows: list[list[str]]) -> str:
+    """Rows as CSV."""
     written = io.StringIO()
-    writer = csv.writer(written, lineterminator="\n")
-    writer.writerow(["scene", "variant", *(WORDS[key] for key in STEP_COLUMNS)])
-    for scene in STEPS_OF:
-        for row in record_of(scene)["rows"]:
-            writer.writerow([scene, row["name"], *(number(row, key) for key in STEP_COLUMNS)])
+    csv.writer(written, lineterminator="\n").writerows(rows)
     return written.getvalue()
 
 
@@ -128,3 +147,4 @@ if __name__ == "__main__":
             path.write_text(new, encoding="utf-8")
             print(path.name)
     STEPS.write_text(steps(), encoding="utf-8")
+    CHOICES.write_text(choices(), encoding="utf-8")

@@ -45,7 +45,8 @@ def test_every_table_is_that_of_its_results(tables):
         assert tables.written(text) == text, f"{page.name}: .venv/bin/python docs/tables.py"
         assert text.count("<!-- table of ") == len(tables.TABLE.findall(text))
         assert text.count("<!-- numbers of ") == len(tables.NUMBERS.findall(text))
-    assert tables.STEPS.read_text(encoding="utf-8") == tables.steps(), ".venv/bin/python docs/tables.py"
+    for path, written in ((tables.STEPS, tables.steps), (tables.CHOICES, tables.choices)):
+        assert path.read_text(encoding="utf-8") == written(), ".venv/bin/python docs/tables.py"
 
 
 def test_numbers_of_a_run_are_those_of_its_metrics(tables, tmp_path, monkeypatch):
@@ -66,3 +67,16 @@ def test_a_table_has_the_rows_and_columns_that_its_comment_names(tables, tmp_pat
     assert tables.written(PAGE.format("anything\n")) == PAGE.format(LINES)
     with pytest.raises(KeyError, match="three"):
         tables.written(PAGE.format("").replace("two:", "three:"))
+
+
+def test_a_table_without_rows_has_all_and_one_may_have_rows_of_others(tables, tmp_path, monkeypatch):
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results/own.json").write_text(json.dumps(RECORD))
+    (tmp_path / "results/other-0.08.json").write_text(json.dumps({"rows": [{"name": "one", "energy_ratio": "stopped"}]}))
+    monkeypatch.setattr(tables, "HERE", tmp_path)
+    page = "<!-- table of {}: energy_ratio\n{}-->\n{}<!-- end of table -->"
+    head = "| | energy, model / truth |\n|---|---|\n"
+    assert tables.written(page.format("own", "", "")) == page.format("own", "", head + "| `one` | 0.996 |\n| `two` |  |\n")
+    rows = "one: here\nother-0.08/one: there\n"
+    assert tables.written(page.format("own", rows, "")) == page.format(
+        "own", rows, head + "| here | 0.996 |\n| there | stopped |\n")

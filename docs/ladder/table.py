@@ -1,11 +1,11 @@
-"""Writes the table of a run of the ladder, of its choices or its widths: each variant on the flows of the test.
+"""Writes the results of a run of the ladder, of its choices or its widths: each variant on the flows of the test.
 
     .venv/bin/python docs/ladder/table.py runs/ladder [--seconds]
 
-Realisation 2 serves the choice, the others the test, whose mean and standard deviation stand in the table. With
-`--seconds` the seconds of a turnover are measured, all rungs in turn on one core, else they are those of the last
-measurement. Writes ../results/RUN.json, and for the ladder the figure ../paper/ladder.png: error at T over the cost of
-a turnover.
+Realisation 2 serves the choice, the others the test, whose mean and standard deviation stand in the tables of the page
+(`docs/tables.py`). With `--seconds` the seconds of a turnover are measured, all rungs in turn on one core, else they
+are those of the last measurement. Writes ../results/RUN.json, and for the ladder the figure ../paper/ladder.png: error
+at T over the cost of a turnover.
 """
 
 import argparse
@@ -33,19 +33,21 @@ CHOICE = "realisation-2"
 LINE = "paper", "horizons-24", "local", "resolved"
 NAMED = *LINE, "together", "to-resolved", "no-density"
 FRAMES = 6  # of the timing
-#: Measures by their names in the table of the page; the others are stored alone.
-SHOWN = {"acceleration_error": "a priori", "velocity_error_half": "T/2", "velocity_error_end": "T",
-         "plane_difference": "field at T", "energy_ratio": "energy", "spectrum_error": "spectrum",
-         "count_variance": "counts"}
-STORED = *SHOWN, "velocity_error_early"
+STORED = ("acceleration_error", "velocity_error_early", "velocity_error_half", "velocity_error_end", "plane_difference",
+          "energy_ratio", "spectrum_error", "count_variance")
+
+
+def rounded(value: float) -> float:
+    """The digits that are stored."""
+    return float(f"{value:.5g}")
 
 
 def measures_of(directory: Path) -> dict[str, float | None]:
     """The measures of a rollout, and the time at which it broke off."""
     found, _ = read(directory, MPI.COMM_SELF)
     numbers = found["rollout"] | found["accuracy"]
-    row = {name: numbers.get(name) for name in STORED}
-    return row if numbers["stable"] else row | {"plane_difference": None, "broken": numbers["turnovers"]}
+    row = {name: None if numbers.get(name) is None else rounded(numbers[name]) for name in STORED}
+    return row if numbers["stable"] else row | {"plane_difference": None, "broken": rounded(numbers["turnovers"])}
 
 
 def step_of(directory: Path, scene: Scene) -> TimeStep:
@@ -72,26 +74,30 @@ def seconds_of(scene: Scene, directory: Path, step: TimeStep, truth: Path) -> fl
         return (time.perf_counter() - began) / (run.time - start) * opened.reference["eddy_turnover_time"]
 
 
-def cell(rows: list[dict], key: str) -> str:
-    """Mean and standard deviation, or when the rollouts broke off."""
+def combined(flows: dict[str, dict]) -> dict[str, float | str | None]:
+    """Means and standard deviations over the flows of the test; a word on rollouts that broke off."""
+    rows = [row for name, row in flows.items() if name != CHOICE]
     broken = [row["broken"] for row in rows if "broken" in row]
-    known = [row[key] for row in rows if row[key] is not None]
-    if key == "velocity_error_end" and broken:
-        return f"{len(broken)} of {len(rows)} break off, after {min(broken):.2g} T"
-    if len(known) < len(rows):
-        return ""
-    return f"{np.mean(known):.3g}" + (f" ± {np.std(known, ddof=1):.1g}" if len(known) > 1 else "")
+    found: dict[str, float | str | None] = {}
+    for key in STORED:
+        values = [row[key] for row in rows]
+        if None in values:
+            found[key] = None
+        else:
+            found |= {key: rounded(np.mean(values)), f"{key}_spread": rounded(np.std(values, ddof=1))}
+    if broken:
+        found["velocity_error_end"] = f"{len(broken)} of {len(rows)} break off, after {min(broken):.2g} T"
+    return found
 
 
 @styled
-def figure(found: dict[str, dict]):
+def figure(rows: list[dict]):
     """Velocity error at T over seconds a turnover: mean and standard deviation of the flows of the test."""
     drawn, axes = panels(1, 1, (7.0, 4.4))
     axis, points = axes[0, 0], {}
-    for name, row in found.items():
-        errors = [other["velocity_error_end"] for other in row["tests"]]
-        if None not in errors and "seconds" in row:
-            points[name] = row["seconds"], float(np.mean(errors)), float(np.std(errors, ddof=1))
+    for row in rows:
+        if "velocity_error_end_spread" in row and "wall_seconds" in row:
+            points[row["name"]] = row["wall_seconds"], row["velocity_error_end"], row["velocity_error_end_spread"]
     line = [name for name in LINE if name in points]
     axis.plot(*np.transpose([points[name][:2] for name in line]), color=GUIDE, linewidth=1, zorder=1)
     free = points.pop("no-force", None)
@@ -114,34 +120,26 @@ def figure(found: dict[str, dict]):
 
 def main(run: Path, timed: bool) -> None:
     results = RESULTS / f"{run.name}.json"
-    before = json.loads(results.read_text()) if results.exists() else {}
-    scene, found = load_scene(run / "scene.toml"), {}
+    before = {row["name"]: row for row in json.loads(results.read_text())["rows"]} if results.exists() else {}
+    scene, rows = load_scene(run / "scene.toml"), []
     for name, runs in rollouts(scene, run).items():
         paths, own = [*runs], scene.variant[name]
         if not all((path / "rollout.h5").exists() and is_current(path) for path in paths):
             print(f"{name}: left out, its rollouts or their measures are missing")
             continue
         step = step_of(run / name, own)
-        row = {"step": step.size, "integrator": step.integrator}
+        row = {"name": name, "step_size": step.size, "step_integrator": step.integrator}
         if (run / name / "model.h5").exists():
             row["training_seconds"] = json.loads((run / name / "stage_seconds.json").read_text()).get("train")
-        if timed:
-            row["seconds"] = seconds_of(runs[paths[1]], paths[1], step, paths[1] / "ground_truth.h5")
-        elif "seconds" in before.get(name, {}):
-            row["seconds"] = before[name]["seconds"]
-        measures = {path.name: measures_of(path) for path in paths}
-        row |= {"choice": measures.pop(CHOICE)} if CHOICE in measures else {}
-        found[name] = row | {"tests": [*measures.values()]}
-    results.write_text(json.dumps(found, indent=1) + "\n")
+        seconds = (seconds_of(runs[paths[1]], paths[1], step, paths[1] / "ground_truth.h5") if timed else
+                   before.get(name, {}).get("wall_seconds", math.nan))
+        if math.isfinite(seconds):
+            row["wall_seconds"] = rounded(seconds)
+        flows = {path.name: measures_of(path) for path in paths}
+        rows.append(row | combined(flows) | {"flows": flows})
+    results.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
     if run.name == "ladder":
-        FIGURE.write_bytes(png(figure(found)))
-    print(f"| rung | seconds a turnover | training (s) | {' | '.join(SHOWN.values())} |")
-    print("|---" * (3 + len(SHOWN)) + "|")
-    for name, row in found.items():
-        seconds = f"{row['seconds']:.2g}" if row.get("seconds", math.nan) > 0 else ""
-        training = f"{float(format(row['training_seconds'], '.2g')):g}" if row.get("training_seconds") else ""
-        cells = (cell(row["tests"], key) for key in SHOWN)
-        print(f"| `{name}` | {seconds} | {training} | {' | '.join(cells)} |")
+        FIGURE.write_bytes(png(figure(rows)))
 
 
 if __name__ == "__main__":
