@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from eddies.analysis.track_splines import NO_NOISE, PARABOLA, Fit, smooth
+from eddies.analysis.track_splines import NO_NOISE, PARABOLA, Fit, error_weights, smooth
 
 EDGE = 2 * np.pi
 INTERVAL = 0.1
@@ -59,6 +59,18 @@ def test_velocities_have_errors_of_noise_and_of_smoothing(frames):
     if frames == 20:
         np.testing.assert_allclose(errors.sum(1), squares, rtol=0.15)  # of 3000 motions: five standard deviations
     assert errors.sum() == pytest.approx(squares.sum(), rel=0.05 if frames == 20 else 0.5)
+
+
+@pytest.mark.parametrize("smoothing", [1e-6, 1.0, 100.0])
+def test_errors_of_successive_velocities_are_those_of_shared_positions(smoothing):
+    """Splines of random positions, in the middle of 61 rows. The tolerance is five standard deviations of a correlation
+    of 4000 numbers."""
+    weights, rows = error_weights(smoothing, 61), np.arange(61.0)
+    draws = np.random.default_rng(5).standard_normal((61, 4000))
+    found = Fit(rows, np.zeros((1, 61, 3)), 1.0).spline(smoothing, draws).derivative()(rows[26:36])
+    together = np.correlate(weights, weights, "full")[len(weights) - 1:]
+    expected = np.append(together, np.zeros(10))[1:10]
+    np.testing.assert_allclose(np.corrcoef(found)[0, 1:], expected, atol=5 / 63)
 
 
 def test_velocities_of_smooth_tracks_without_noise():

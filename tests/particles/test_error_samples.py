@@ -119,6 +119,27 @@ def test_the_noise_of_splines_is_that_of_the_frame(comm):
     assert (other < own).all()
 
 
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("remembers", [True, False])
+def test_velocities_of_splines_share_the_noise_of_positions(comm, monkeypatch, remembers):
+    """A velocity has errors of the first and the third position from its own on. Frames without a memory are
+    independent."""
+    solver, drawn = solver_on(comm), []
+    memory = RememberedVelocity(solver, 0.0, torch.ones_like(solver.grid.shell), 16.0) if remembers else None
+    samples, particles = ErrorSamples(solver, 1, memory, (0.6, 0.0, 0.8)), velocities_of(
+        solver, flow_of(solver, 0, 1e-2), 0.1)
+    samples.levels, solve = np.zeros(2), samples._error
+    monkeypatch.setattr(samples, "_error", lambda equations, points, noise, *rest: (
+        drawn.append(noise.ravel().numpy()), solve(equations, points, noise, *rest))[1])
+    for frame in range(3):
+        modes = memory.of(particles, 0.05 * frame) if memory else solver.of(particles).modes
+        list(samples.of(particles, modes, frame, 0.1))
+    # Five standard deviations of 1536 numbers.
+    np.testing.assert_allclose(np.std(drawn, axis=1), 0.1, rtol=5 / 55)
+    correlations = np.corrcoef(drawn)[0, 1:]
+    np.testing.assert_allclose(correlations, [0, 0.48 if remembers else 0], atol=5 / 39)
+
+
 @pytest.mark.mpi(2, 3)
 def test_samples_do_not_depend_on_the_number_of_ranks(comm):
     alone, found = comm.Split(comm.rank), []

@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import ceil
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -37,6 +38,7 @@ PARABOLA = 1e3              # mu divided by the sixth power of the number of row
 TRIED = 300                 # about the number of tracks from which mu is determined
 BLOCK = 256                 # columns of an influence matrix that are computed at a time
 EQUAL = 1e-6                # fraction of the interval below which times of tracks are the same
+FAR = 6                     # rows to each side that count for a velocity, divided by 1 + mu^(1/6)
 RANDOM = 32                 # sets of random errors that stand for those of tracks with more rows
 
 
@@ -52,6 +54,7 @@ class SmoothedTracks:
     position, velocity : (rows, 3). Positions are continuous along a track.
     velocity_errors : (rows, 2), variances of the error of a velocity component, for errors of positions of variance 1:
         of what is left of these errors, and of what smoothing removes from the motion.
+    error_weights : those of the longest track.
     smoothing : mu of the splines.
     residual : noise that the residuals of the longest tracks show. It is the given noise if a mu fits it, and the
         estimate if none is given. It is NaN without noise, and for tracks of three rows, which have no residuals.
@@ -63,6 +66,7 @@ class SmoothedTracks:
     position: np.ndarray
     velocity: np.ndarray
     velocity_errors: np.ndarray
+    error_weights: np.ndarray
     smoothing: float
     residual: float
 
@@ -87,7 +91,7 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
     if not within.any():
         nothing = np.zeros((0, 3))
         return SmoothedTracks(np.zeros(0, int), np.zeros(0), np.zeros(0, int), nothing, nothing, nothing[:, :2],
-                              NO_NOISE, np.nan)
+                              error_weights(NO_NOISE, LEAST_ROWS), NO_NOISE, np.nan)
     interval = float(np.median(steps[within]))
     ends = np.append(np.flatnonzero(~within) + 1, len(order))
     alike: dict[bytes, list[np.ndarray]] = defaultdict(list)
@@ -102,7 +106,21 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
     smoothing, residual = (NO_NOISE, np.nan) if noise == 0 else _smoothing_of(fits, noise)
     parts = [_sampled(fit, smoothing, rows, time[rows[:, 0]], track[rows[:, 0]], fill)
              for fit, rows in zip(fits, groups)]
-    return SmoothedTracks(*map(np.concatenate, zip(*parts)), smoothing, residual)
+    weights = error_weights(smoothing, max(len(fit.times) for fit in fits))
+    return SmoothedTracks(*map(np.concatenate, zip(*parts)), weights, smoothing, residual)
+
+
+def error_weights(smoothing: float, rows: int) -> np.ndarray:
+    """Return how the error of a velocity in the middle of a track of so many rows is made of the errors of successive
+    positions, which are independent.
+
+    The sum of squares of these weights is 1, and their autocorrelation is that of the errors of successive velocities.
+    Rows that are far for a spline with mu = `smoothing` have no weight.
+    """
+    rows = min(rows, 2 * ceil(FAR * (1 + smoothing ** (1 / 6))) + 1)
+    fit = Fit(np.arange(float(rows)), np.zeros((1, rows, 3)), 1.0)
+    weights = fit.spline(smoothing, np.eye(rows)).derivative()(rows // 2)
+    return weights / np.linalg.norm(weights)
 
 
 def _sampled(fit: Fit, smoothing: float, rows: np.ndarray, start: np.ndarray, track: np.ndarray,

@@ -1,7 +1,7 @@
 """Random errors of a velocity that least squares estimate: samples of the Gaussian posterior."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -44,9 +44,10 @@ class ErrorSamples:
     the minimum of one frame gives c and s^2. In other frames c and s^2 follow the mean square of the velocities.
 
     **Smoothed tracks.** Velocities of splines have errors that are known in each frame. What is left of the noise of
-    positions is a part of s^2: the level is that of the rest, and each frame adds its own part. What smoothing removes
-    from the motion is alike at neighbours, so it is no noise of the solve. It is drawn as a velocity with the prior's
-    spectrum, and its level is never measured, since the estimate follows it.
+    positions is a part of s^2: the level is that of the rest, and each frame adds its own part. Successive velocities
+    of a track share the noise of positions, so their errors are drawn from the same random positions. What smoothing
+    removes from the motion is alike at neighbours, so it is no noise of the solve. It is drawn as a velocity with the
+    prior's spectrum, and its level is never measured, since the estimate follows it.
 
     **Memory.** Each sample follows the estimate from frame to frame: `RememberedVelocity.deviation` makes w from the
     previous error and new random modes, so the spread grows by the forecasts and shrinks by the data.
@@ -59,10 +60,12 @@ class ErrorSamples:
     solver : estimates the velocity, or the first frame of a `memory`. Its penalty is the prior.
     count : number of samples.
     memory : the method that estimates the frames, if it has a memory.
+    weights : `error_weights` of splines. Without a memory frames are independent.
     """
 
-    def __init__(self, solver: ResolvedVelocity, count: int, memory: RememberedVelocity | None = None) -> None:
-        self.solver, self.count, self.memory = solver, count, memory
+    def __init__(self, solver: ResolvedVelocity, count: int, memory: RememberedVelocity | None = None,
+                 weights: Sequence[float] = (1.0,)) -> None:
+        self.solver, self.count, self.memory, self.weights = solver, count, memory, weights if memory else (1.0,)
         #: c and s^2 without the noise of splines, over the mean square of the velocity fluctuations
         self.levels: np.ndarray | None = None
         self._errors: list[Tensor] = []
@@ -91,13 +94,16 @@ class ErrorSamples:
         grid, memory = self.solver.grid, self.memory
         equations, points = memory.equations if memory else self.solver.equations, grid.points(particles.position)
         count, square = self._fluctuation(particles, modes, noise)
-        prior, spread = np.sqrt(self.levels * square + [0.0, noise**2])
+        (prior, spread), ids = np.sqrt(self.levels * square), as_numpy(particles.id)
         errors, self._errors = self._errors, []
         for sample in range(self.count):
             deviation = prior * self._random_modes(frame, sample)
             if errors and memory:
                 deviation = memory.deviation(errors[sample], deviation)
-            random = spread * normal(as_numpy(particles.id), frame, sample)
+            random = spread * normal(ids, frame, sample)
+            if noise > 0:
+                random += noise * sum(weight * normal(ids, frame + later, self.count + sample)
+                                      for later, weight in enumerate(self.weights))
             if smoothed > 0:
                 alike = grid.at(self._random_modes(frame, self.count + sample), points)
                 size = global_sum(grid.decomposition.comm, _square(alike)) / (3 * count)

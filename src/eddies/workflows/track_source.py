@@ -16,7 +16,7 @@ from eddies.parallel.communicator import Comm
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.scene.scene import BOX_LENGTH, Reconstruction, SceneError, Tracers, Tracks
-from eddies.workflows.ground_truth.track_frames import TrackFrames, count_for
+from eddies.workflows.ground_truth.track_frames import TrackFrames, count_for, surest
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.track_solver import NO_FILTER, best_solver, particles_on, slabs_for, solver_of
 
@@ -81,14 +81,14 @@ class Source:
     filtered : whether the tracks follow a filtered velocity.
     unit : the scene's unit of length, in the unit of the tracks.
     velocity_noise : rms error of a velocity component, from the noise of positions; 0 for velocities of the file.
-    velocity_errors, surest : as in `MeasuredTracks`; zeros without measured tracks.
+    velocity_errors, error_weights : as in `MeasuredTracks`; errors are zero without measured tracks.
     corner : position of the origin of the tracks' coordinates in the cube, in the unit of the tracks.
     """
 
     def __init__(self, tracks: Tracks | None, tracers: Tracers, settings: Reconstruction, file: File,
                  comm: Comm) -> None:
         self._tracks, self.truth, self.spacing, self.uniform = None, None, tracers.spacing, False
-        self.velocity_noise, self.surest, self.periods = 0.0, 0, np.ones(3, int)
+        self.velocity_noise, self.error_weights, self.periods = 0.0, np.ones(1), np.ones(3, int)
         self.background: LinearFlow | None = None
         self.periodic = tracks is None or tracks.volume is None
         self.filtered, width = (tracks or tracers).filtered, tracers.filter_width
@@ -98,7 +98,7 @@ class Source:
             self.uniform, self.background = source.uniform, source.background
             self.unit, self.corner = source.about["length_unit"], source.about["corner"]
             self.periods = source.about["periods"]
-            self.velocity_errors, self.surest = source.velocity_errors, source.surest
+            self.velocity_errors, self.error_weights = source.velocity_errors, source.error_weights
             self.velocity_noise = source.about.get("velocity_noise", 0.0) / self.unit
             tracers = tracers.with_count(count_for(self.spacing))
         resolved = settings.resolving(tracers, self.filtered)
@@ -109,6 +109,11 @@ class Source:
             self.truth = truth = GroundTruth(file, comm, planes=self.slab.planes)
             self.times, self.most, self.velocity_errors = truth.times, truth.total, np.zeros((len(truth.times), 2))
             self.unit, self.corner = 1.0, np.zeros(3)
+
+    @property
+    def surest(self) -> int:
+        """The frame with the smallest `velocity_errors`."""
+        return surest(self.velocity_errors)
 
     def particles(self, frame: int) -> ParticleSet:
         """Return this rank's particles of a frame, with position and velocity; collective."""

@@ -34,7 +34,7 @@ from eddies.scene.scene import BOX_LENGTH, Flow, Scene, SceneError, Tracers
 from eddies.scene.sections import Eulerian, Initial, Reconstruction, Tracks
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.workflows.ground_truth.flow_run import write_spectra
-from eddies.workflows.ground_truth.track_frames import TrackFrames, count_for, read_measured
+from eddies.workflows.ground_truth.track_frames import TrackFrames, count_for, read_measured, surest
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 from eddies.workflows.track_solver import (NO_FILTER, LeastSquaresMethod, UniformMethod, best_solver, particles_on,
                                            slabs_for, solver_of, solving_method)
@@ -232,7 +232,7 @@ class FittedFlows:
             self.slab = slabs_for(tracks.comm, own, resolved, width, self.reference["kolmogorov_length"])
             make = partial(solver_of, self.slab, self.reference | {"spacing": resolved.spacing, "filter_width": width},
                            tracks.about["periods"])
-            solver, self.weight, self.error = best_solver(particles_on(self.slab, tracks.frame(tracks.surest)), make,
+            solver, self.weight, self.error = best_solver(particles_on(self.slab, tracks.frame(surest(tracks.velocity_errors))), make,
                                                           uniform=tracks.uniform)
             self.grid = solver.grid
             self.method = UniformMethod(solver) if tracks.uniform else LeastSquaresMethod(solver)

@@ -44,6 +44,7 @@ class MeasuredTracks:
         units of its mean. Velocities are those beside the `background`.
     velocity_errors : (frames, 2), rms errors of a velocity component in each frame, by the splines: of what is left of
         the noise, and of what smoothing removes from the motion. They are 0 for velocities of the file.
+    error_weights : of the noise of successive positions in the error of a velocity; see `track_splines`.
     background : the mean flow of [tracks] background = "linear"; None without it.
     uniform : whether all tracks of a frame have the same velocity, in each frame.
     throughout : whether the track of a row is present in all frames, (rows,).
@@ -57,6 +58,7 @@ class MeasuredTracks:
     starts: np.ndarray
     columns: Mapping[str, np.ndarray]
     velocity_errors: np.ndarray
+    error_weights: np.ndarray
     background: LinearFlow | None
     uniform: bool
     throughout: np.ndarray
@@ -67,11 +69,6 @@ class MeasuredTracks:
     def mean_count(self) -> float:
         """Mean number of rows of a frame."""
         return len(self.throughout) / len(self.times)
-
-    @property
-    def surest(self) -> int:
-        """The frame with the smallest `velocity_errors`."""
-        return int(np.argmin(np.square(self.velocity_errors).sum(1)))
 
     @property
     def complete(self) -> int:
@@ -94,6 +91,11 @@ class MeasuredTracks:
         return {name: values[rows] for name, values in self.columns.items()}
 
 
+def surest(velocity_errors: np.ndarray) -> int:
+    """Return the frame with the smallest `MeasuredTracks.velocity_errors`."""
+    return int(np.argmin(np.square(velocity_errors).sum(1)))
+
+
 class TrackFrames:
     """The frames of a file with tracks. Rank 0 holds them; the methods divide their rows among the ranks. The
     constructor and all methods are collective."""
@@ -101,9 +103,9 @@ class TrackFrames:
     def __init__(self, comm: Comm, settings: Settings) -> None:
         self.comm = comm
         (self.times, self.about, self.mean_count, self.complete, self.spacing, self.background, self.uniform,
-         self.velocity_errors, self.surest, self.most) = in_files(comm, settings.file, lambda: (
+         self.velocity_errors, self.error_weights, self.most) = in_files(comm, settings.file, lambda: (
              (found := read_measured(settings)).times, found.about, found.mean_count, found.complete, found.spacing,
-             found.background, found.uniform, found.velocity_errors, found.surest,
+             found.background, found.uniform, found.velocity_errors, found.error_weights,
              int(np.diff(found.starts).max())))
         self._tracks = read_measured(settings) if comm.rank == 0 else None
 
@@ -152,10 +154,10 @@ def _read_measured(settings: Settings, versions: tuple[FileVersion, ...]) -> Mea
     smoothed = found.velocity is None or settings.noise not in (None, 0)
     measured, interval = _at_frames(found, settings, settings.longest_gap if smoothed else 0)
     if smoothed:
-        found, noise, errors = _smoothed(measured, period, interval, settings, about)
+        found, noise, errors, weights = _smoothed(measured, period, interval, settings, about)
     else:
         check_velocities(measured, period, settings.file)
-        found, noise, errors = measured, 0.0, np.zeros((len(measured.time), 2))
+        found, noise, errors, weights = measured, 0.0, np.zeros((len(measured.time), 2)), np.ones(1)
     if period is None or not _continuous(measured, period, noise):
         check_inside(measured, lower, upper, "box" if period else "volume", settings.file, noise)
     times = interval * np.arange(round(measured.time[-1] / interval) + 1)
@@ -182,14 +184,14 @@ def _read_measured(settings: Settings, versions: tuple[FileVersion, ...]) -> Mea
         log.warning("%s: all tracks move alike%s: the velocity field is uniform, and there are no errors relative to "
                     "its fluctuation", settings.file, "" if background is None else " beside the background")
     errors = np.sqrt(np.add.reduceat(errors, found.starts[:-1]) / np.diff(found.starts)[:, None]) / unit
-    return MeasuredTracks(times, found.starts, columns, errors, background, uniform, (counts == len(times))[place],
+    return MeasuredTracks(times, found.starts, columns, errors, weights, background, uniform, (counts == len(times))[place],
                           spacing, about | {"length_unit": unit, "corner": corner, "periods": periods})
 
 
 def _smoothed(found: Tracks, period: float | None, interval: float, settings: Settings,
-              about: dict[str, Any]) -> tuple[Tracks, float, np.ndarray]:
-    """Return the tracks with the positions and velocities of splines, the noise of a coordinate, and the variances
-    (rows, 2) of the errors of a velocity component.
+              about: dict[str, Any]) -> tuple[Tracks, float, np.ndarray, np.ndarray]:
+    """Return the tracks with the positions and velocities of splines, the noise of a coordinate, the variances
+    (rows, 2) of the errors of a velocity component, and the `error_weights` of the splines.
 
     A track that lacks more than [tracks] longest_gap frames is divided there; shorter gaps are filled, unless the
     tracks have densities. Attributes of the product are added to `about`.
@@ -221,7 +223,7 @@ def _smoothed(found: Tracks, period: float | None, interval: float, settings: Se
         if count:
             log.info("%s: %d %s", file, count, what)
     return Tracks(np.rint(splines.time[order] / interval) * interval, splines.track[order], splines.position[order],
-                  splines.velocity[order], None if found.density is None else found.density[rows]), noise, errors
+                  splines.velocity[order], None if found.density is None else found.density[rows]), noise, errors, splines.error_weights
 
 
 def _continuous(found: Tracks, edge: float, noise: float) -> bool:
