@@ -6,7 +6,8 @@ import torch
 
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.error_samples import ErrorSamples, normal, positive_solution, white_modes
+from eddies.particles.error_samples import (ErrorSamples, UnresolvedScales, carried_weights, normal, positive_solution,
+                                            white_modes)
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.remembered_velocity import RememberedVelocity
@@ -138,6 +139,21 @@ def test_velocities_of_splines_share_the_noise_of_positions(comm, monkeypatch, r
     np.testing.assert_allclose(np.std(drawn, axis=1), 0.1, rtol=5 / 55)
     correlations = np.corrcoef(drawn)[0, 1:]
     np.testing.assert_allclose(correlations, [0, 0.48 if remembers else 0], atol=5 / 39)
+
+
+@pytest.mark.mpi(1)
+def test_scales_beyond_the_modes_are_carried_along(comm):
+    """The variance of a component is 1, less a tenth that splines lose of the highest modes; almost half of it is that
+    of modes on the grid. Frames are alike as exp(-(angle lag)^2 / 2)."""
+    solver = solver_on(comm, planes=28)
+    points = solver.grid.points(torch.from_numpy(np.random.default_rng(6).uniform(0, 2 * np.pi, (4000, 3))))
+    beyond, weights = UnresolvedScales(solver), carried_weights(0.5)
+    drawn = np.stack([beyond.at(points, np.arange(4000), frame, 0, weights).numpy().ravel() for frame in (0, 1, 2, 9)])
+    assert 0.3 < beyond._white < 0.7
+    # They are 12000 numbers from as many modes; five standard deviations of a variance are 6 %.
+    np.testing.assert_allclose(drawn.var(axis=1), 1, atol=0.14)
+    np.testing.assert_allclose(np.corrcoef(drawn)[0, 1:], [np.exp(-1 / 8), np.exp(-1 / 2), 0], atol=0.1)
+    assert list(carried_weights(0.0)) == [1.0] and len(carried_weights(1e-3)) == 17
 
 
 @pytest.mark.mpi(2, 3)

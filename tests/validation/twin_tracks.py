@@ -68,9 +68,10 @@ SETS = {"hit": ("whole-8", "whole-16", "whole-32", "filtered-8", "filtered-16", 
 MAPPED = {"hit-small": [
     *(Case(f"{kind}-{side}", "least-squares", noise, samples=16 if side < 32 else 8)
       for kind in ("whole", "filtered") for side, noise in ((8, 0.0), (16, 0.0), (32, 0.0), (16, 0.1))),
-    Case("filtered-8", "memory"), Case("whole-8", "memory", samples=4, frames=10),
-    Case("filtered-16", "memory", samples=8), Case("filtered-16", "memory", noise=0.1, samples=8),
-    *(Case(name, "memory", samples=4, frames=10) for name in ("whole-16", "filtered-32"))]}
+    Case("filtered-8", "memory"), *(Case("filtered-16", "memory", noise, samples=8) for noise in (0.0, 0.1)),
+    Case("filtered-32", "memory", samples=8, frames=10),
+    *(Case(f"whole-{side}", "memory", noise, samples=4, frames=10)
+      for side, noise in ((8, 0.0), (16, 0.0), (32, 0.0), (16, 0.1)))]}
 # Done to the tracks of `hit` alone.
 FURTHER = [
     *(Case(name, method) for name in ("whole-16", "filtered-32") for method in ("kriging", "average")),

@@ -20,6 +20,8 @@ from eddies.particles.resolved_velocity import ResolvedVelocity
 TOLERANCE = 4e-3
 # Number of draws that measure the levels of prior and noise. Each averages over all particles and modes.
 DRAWS = 4
+# Weights of frames that are independent. Others reach to where a phase turns by CARRIED, or for MOST_CARRIED frames.
+ALONE, CARRIED, MOST_CARRIED = (1.0,), 2.0, 8
 # Shifts and factors that mix all 64 bits of an id (the finaliser of splitmix64; Steele, Lea and Flood 2014). Ids of
 # tracks may have any pattern, such as the number of a camera in their upper bits.
 MIXING = ((30, 0xbf58476d1ce4e5b9), (27, 0x94d049bb133111eb), (31, 1))
@@ -36,8 +38,8 @@ class ErrorSamples:
         A e = P B^T n - penalty w,    A = P B^T B + penalty.
 
     With the variances that the penalty assumes, these are samples of the posterior. Here the variances are those that
-    the data show, so the errors are honest also where the penalty was chosen for another reason. The noise n is white
-    and stands for errors of the velocities and for scales beyond the modes.
+    the data show, so the errors are honest also where the penalty was chosen for another reason. The noise n stands for
+    `UnresolvedScales` and, for velocities of splines, for errors of the velocities.
 
     **Levels.** The prior's variance is c / penalty, and the noise has the variance s^2. Both sums of the minimum, the
     misfit and the penalty, have expected values that are linear in c and s^2. A few draws give the coefficients, and
@@ -50,7 +52,8 @@ class ErrorSamples:
     prior's spectrum, and its level is never measured, since the estimate follows it.
 
     **Memory.** Each sample follows the estimate from frame to frame: `RememberedVelocity.deviation` makes w from the
-    previous error and new random modes, so the spread grows by the forecasts and shrinks by the data.
+    previous error and new random modes, so the spread grows by the forecasts and shrinks by the data. The flow carries
+    unresolved scales along, so theirs are as alike in two frames as modes that turn by random phases k_c u' dt.
 
     Random numbers belong to a frame, a sample, and an id or a plane of the grid, so they do not depend on the number of
     ranks. All methods are collective.
@@ -61,11 +64,14 @@ class ErrorSamples:
     count : number of samples.
     memory : the method that estimates the frames, if it has a memory.
     weights : `error_weights` of splines. Without a memory frames are independent.
+    every : number of frames from one estimate to the next.
     """
 
     def __init__(self, solver: ResolvedVelocity, count: int, memory: RememberedVelocity | None = None,
-                 weights: Sequence[float] = (1.0,)) -> None:
-        self.solver, self.count, self.memory, self.weights = solver, count, memory, weights if memory else (1.0,)
+                 weights: Sequence[float] = ALONE, every: int = 1) -> None:
+        self.solver, self.count, self.memory, self.every = solver, count, memory, every
+        self.weights = weights if memory else ALONE
+        self._beyond = UnresolvedScales(solver)
         #: c and s^2 without the noise of splines, over the mean square of the velocity fluctuations
         self.levels: np.ndarray | None = None
         self._errors: list[Tensor] = []
@@ -95,15 +101,15 @@ class ErrorSamples:
         equations, points = memory.equations if memory else self.solver.equations, grid.points(particles.position)
         count, square = self._fluctuation(particles, modes, noise)
         (prior, spread), ids = np.sqrt(self.levels * square), as_numpy(particles.id)
+        carried = carried_weights(memory.angle / self.every) if memory else ALONE
         errors, self._errors = self._errors, []
         for sample in range(self.count):
             deviation = prior * self._random_modes(frame, sample)
             if errors and memory:
                 deviation = memory.deviation(errors[sample], deviation)
-            random = spread * normal(ids, frame, sample)
+            random = spread * self._beyond.at(points, ids, frame, sample, carried)
             if noise > 0:
-                random += noise * sum(weight * normal(ids, frame + later, self.count + sample)
-                                      for later, weight in enumerate(self.weights))
+                random += noise * normal(ids, frame, self.count + sample, self.weights)
             if smoothed > 0:
                 alike = grid.at(self._random_modes(frame, self.count + sample), points)
                 size = global_sum(grid.decomposition.comm, _square(alike)) / (3 * count)
@@ -136,7 +142,8 @@ class ErrorSamples:
         grid, equations = self.solver.grid, self.solver.equations
         sums = [np.array([_square(particles.velocity - grid.at(modes, points)), self._penalty_of(modes)])]
         for sample in range(DRAWS):
-            flow, noise = self._random_modes(0, sample), normal(as_numpy(particles.id), 0, sample)
+            flow = self._random_modes(0, sample)
+            noise = self._beyond.at(points, as_numpy(particles.id), 0, sample)
             of_flow = self._error(equations, points, torch.zeros_like(noise), flow, count)
             of_noise = self._error(equations, points, noise, torch.zeros_like(flow), count)
             sums += [np.array([_square(of_flow.at_points), self._penalty_of(flow + of_flow.modes)]),
@@ -163,6 +170,34 @@ class ErrorSamples:
         return float((weight * (modes.real.square() + modes.imag.square()).sum(0)).sum())
 
 
+class UnresolvedScales:
+    """Random velocities of the scales beyond the modes of a solver. A component has the variance 1.
+
+    The modes just beyond k_c pass for those just below it, so they disturb an estimate more than white noise does. As
+    far as the grid holds them, they are a solenoidal velocity with the prior's spectrum; the rest is white noise.
+    """
+
+    def __init__(self, solver: ResolvedVelocity) -> None:
+        slab, own = solver.grid.decomposition, solver.grid
+        highest = (slab.planes - 1) // 2
+        self.grid, self._white = None, 1.0
+        if highest > own.resolved:
+            self.grid = grid = FourierGrid(slab, highest, round(own.reach / slab.spacing), own.dtype)
+            inside = (grid.shell > own.resolved) & (grid.shell <= highest) & grid.repeating(solver.periods)
+            energy, rest = solver.expected_energy(grid, inside)
+            self._white = rest / solver.expected_energy(own, own.shell > 0)[1]
+            self._amplitude = (3 * (1 - self._white) * energy).sqrt()
+
+    def at(self, points: Points, ids: np.ndarray, frame: int, sample: int,
+           weights: Sequence[float] = ALONE) -> Tensor:
+        """Return the velocities (n, 3) at points of the solver's grid; `weights` as in `white_modes`. Collective."""
+        found = math.sqrt(self._white) * normal(ids, frame, sample, weights)
+        if self.grid is None:
+            return found
+        modes = self.grid.solenoidal(white_modes(self.grid, frame, sample, weights))
+        return found + self.grid.at(self._amplitude * modes, points)
+
+
 def positive_solution(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Solve two equations for two numbers that are not negative. If there is no such solution, return the numbers with
     the smallest sum of squared relative residuals; zeros if `right` is not positive."""
@@ -176,25 +211,37 @@ def positive_solution(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     return min(alone, key=lambda numbers: float(np.square(scaled @ numbers - 1).sum()))
 
 
-def white_modes(grid: FourierGrid, frame: int, sample: int) -> Tensor:
+def carried_weights(angle: float) -> np.ndarray:
+    """Return `weights` of frames whose autocorrelation is exp(-(angle lag)^2 / 2): that of a mode with a normally
+    distributed velocity, whose rms turns its phase by `angle` from frame to frame."""
+    lags = np.arange(min(math.ceil(CARRIED / angle), MOST_CARRIED) + 1 if angle > 0 else 1)
+    weights = np.exp(-(angle * np.append(lags[:0:-1], lags)) ** 2)
+    return weights / np.linalg.norm(weights)
+
+
+def white_modes(grid: FourierGrid, frame: int, sample: int, weights: Sequence[float] = ALONE) -> Tensor:
     """Return modes (3, kz, ky, kx) of random fields; the mean square of each component of a mode is 1.
 
+    A field is the sum of independent ones of this and later frames with these weights, whose squares have the sum 1.
     Each plane of the grid has its own generator, so the fields do not depend on the number of ranks. Collective.
     """
     slab = grid.decomposition
-    planes = [np.random.default_rng([frame, sample, plane]).standard_normal((3, slab.planes, slab.planes))
-              for plane in range(slab.start, slab.stop)]
+    planes = [sum(weight * np.random.default_rng([frame + later, sample, plane]).standard_normal(
+        (3, slab.planes, slab.planes)) for later, weight in enumerate(weights))
+        for plane in range(slab.start, slab.stop)]
     fields = np.stack(planes, axis=1) if planes else np.zeros((3, 0, slab.planes, slab.planes))
     return grid.to_modes(torch.from_numpy(fields).to(grid.dtype)) * slab.planes**1.5
 
 
-def normal(ids: np.ndarray, frame: int, sample: int) -> Tensor:
+def normal(ids: np.ndarray, frame: int, sample: int, weights: Sequence[float] = ALONE) -> Tensor:
     """Return random numbers (n, 3) with a standard normal distribution that depend on the ids (n,), the frame and the
-    sample only (Box and Muller)."""
-    key = mixed(np.array([frame * 2**32 + sample]))
-    first, second = ((mixed(mixed(ids)[:, None] ^ (key + np.uint64(number)) ^ mixed(np.arange(1, 4)))
-                      >> np.uint64(11)) + 0.5 for number in range(2))
-    return torch.from_numpy(np.sqrt(-2 * np.log(first / 2.0**53)) * np.cos(2 * math.pi * second / 2.0**53))
+    sample only (Box and Muller). `weights` are as in `white_modes`."""
+    total, own = np.zeros((len(ids), 3)), mixed(ids)[:, None] ^ mixed(np.arange(1, 4))
+    for later, weight in enumerate(weights):
+        key = mixed(np.array([(frame + later) * 2**32 + sample]))
+        first, second = ((mixed(own ^ (key + np.uint64(number))) >> np.uint64(11)) + 0.5 for number in range(2))
+        total += weight * np.sqrt(-2 * np.log(first / 2.0**53)) * np.cos(2 * math.pi * second / 2.0**53)
+    return torch.from_numpy(total)
 
 
 def mixed(ids: np.ndarray) -> np.ndarray:

@@ -55,6 +55,8 @@ class RememberedVelocity:
         self._count = 0.0
         #: the equations of the latest moment
         self.equations = self.solver.equations
+        #: phase k_c u' dt by which the flow carries the highest modes between the latest two moments; 0 before
+        self.angle = 0.0
         self._prior: _Prior | None = None
 
     @torch.no_grad()
@@ -71,8 +73,10 @@ class RememberedVelocity:
             before, latest = self._latest
             mean, latest, step = grid.mean(latest), grid.without_mean(latest), time - before
             count, square = global_sum(comm, np.array([count, float((particles.velocity - mean).square().sum())]))
-            turn = step * grid.wavenumber_squared.sqrt() * self._speed(latest / self.transfer)
-            worth, points = torch.exp(-turn / (2 * self.memory)), grid.points(particles.position)
+            shift = step * self._speed(latest / self.transfer)
+            self.angle = shift * self._highest
+            worth = torch.exp(-shift * grid.wavenumber_squared.sqrt() / (2 * self.memory))
+            points = grid.points(particles.position)
             self._penalty = self._next_penalty(worth)
             self.equations = LeastSquares(grid, self.solver.equations.inside, self._penalty)
             self._prior = _Prior(latest, self.forecast(latest, step), step, mean, worth)
@@ -115,8 +119,7 @@ class RememberedVelocity:
     def forecast(self, modes: Tensor, step: float) -> Tensor:
         """Return the modes, with mean zero, after the time `step`, by Runge-Kutta substeps of fourth order."""
         whole = modes / self.transfer
-        highest = self.solver.grid.resolved * 2 * math.pi / self.solver.grid.decomposition.length
-        steps = max(math.ceil(step * highest * self._speed(whole) / ANGLE), 1)
+        steps = max(math.ceil(step * self._highest * self._speed(whole) / ANGLE), 1)
         dt = step / steps
         for _ in range(steps):
             first = self._change(whole)
@@ -124,6 +127,11 @@ class RememberedVelocity:
             third = self._change(whole + dt / 2 * second)
             whole = whole + dt / 6 * (first + 2 * (second + third) + self._change(whole + dt * third))
         return whole * self.transfer
+
+    @property
+    def _highest(self) -> float:
+        """k_c"""
+        return self.solver.grid.resolved * 2 * math.pi / self.solver.grid.decomposition.length
 
     def _change(self, whole: Tensor) -> Tensor:
         """Return du/dt = P[-div(uu)] + nu laplacian u for the modes `whole` of the velocity u before the filter."""

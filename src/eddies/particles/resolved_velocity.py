@@ -174,10 +174,12 @@ class ResolvedVelocity:
 
     def __init__(self, grid: FourierGrid, filter_width: float, kolmogorov_length: float = 0.0,
                  weight: float = WEIGHT, periods: Sequence[int] = (1, 1, 1)) -> None:
-        self.grid, self.filter_width = grid, filter_width
+        self.grid, self.filter_width, self.periods = grid, filter_width, periods
+        #: `expected_energy` of the flow
+        self.expected_energy = partial(expected_energy, filter_width=filter_width, kolmogorov_length=kolmogorov_length)
         inside = (grid.shell <= grid.resolved) & grid.repeating(periods)
         penalized = (grid.shell > 0) & inside
-        energy, unresolved = _prior(grid, filter_width, kolmogorov_length, penalized)
+        energy, unresolved = self.expected_energy(grid, penalized)
         penalty = torch.where(penalized, weight * unresolved / (3 * torch.where(penalized, energy, 1.0)), 0.0)
         self.equations = LeastSquares(grid, inside, penalty)
         self.forget()
@@ -377,12 +379,13 @@ def dissipation_range(k_eta: np.ndarray) -> np.ndarray:
     return np.exp(DISSIPATION * (DISSIPATION_ONSET - (k_eta**4 + DISSIPATION_ONSET**4) ** 0.25))
 
 
-def _prior(grid: FourierGrid, filter_width: float, kolmogorov_length: float,
-           inside: Tensor) -> tuple[Tensor, float]:
-    """Return the energy P_k (kz, ky, kx) of each of the two solenoidal components of a mode, and the energy beyond k_c.
+def expected_energy(grid: FourierGrid, inside: Tensor, filter_width: float,
+                    kolmogorov_length: float) -> tuple[Tensor, float]:
+    """Return the energy P_k (kz, ky, kx) of each of the two solenoidal components of a mode, and the energy beyond the
+    highest wavenumber of the grid.
 
-    P_k is in units of <v.v> of the modes up to k_c, and 0 where `inside` is False. The energy beyond k_c is in units of
-    <v.v> of all modes.
+    P_k is in units of <v.v> of the modes `inside`, and 0 for others. The energy beyond is in units of <v.v> of all
+    modes.
     """
     unit = 2 * math.pi / grid.decomposition.length
     law = partial(_mode_energy, filter_width=filter_width, kolmogorov_length=kolmogorov_length)

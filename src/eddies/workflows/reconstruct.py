@@ -225,7 +225,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         holdout = 0.0 if source.uniform else settings.holdout
         methods = [make() for _ in range(2 if holdout > 0 else 1)]
         samples = ErrorSamples(solver, settings.samples, methods[0] if isinstance(methods[0], RememberedVelocity)
-                               else None, source.error_weights)
+                               else None, source.error_weights, settings.every)
         expected = _of_small_scales(source, grid)
         density = scene.tracks.density if scene.tracks is not None else None
         medium = Medium(transfer, source.scales["viscosity"], source.unit, source.background, density or 1.0,

@@ -232,8 +232,8 @@ class FittedFlows:
             self.slab = slabs_for(tracks.comm, own, resolved, width, self.reference["kolmogorov_length"])
             make = partial(solver_of, self.slab, self.reference | {"spacing": resolved.spacing, "filter_width": width},
                            tracks.about["periods"])
-            solver, self.weight, self.error = best_solver(particles_on(self.slab, tracks.frame(surest(tracks.velocity_errors))), make,
-                                                          uniform=tracks.uniform)
+            known_best = particles_on(self.slab, tracks.frame(surest(tracks.velocity_errors)))
+            solver, self.weight, self.error = best_solver(known_best, make, uniform=tracks.uniform)
             self.grid = solver.grid
             self.method = UniformMethod(solver) if tracks.uniform else LeastSquaresMethod(solver)
             # The velocity_rms is that of the particles.
