@@ -39,9 +39,11 @@ STYLE = {
     "legend.frameon": False, "figure.dpi": 150, "savefig.dpi": 150, "axes.prop_cycle": matplotlib.cycler(
         color=[BLUE, MODEL, SECOND, THIRD, FOURTH, DNS]),
 }
-# Colour and marker of each method in all figures, by the name of its preset; "none": without any force.
+# Colour and marker of each method in all figures, by the name of its preset; "none": without any force. Forms of one
+# kind have one colour.
 LOOKS = {"paper": (MODEL, "o"), "resolved": (SECOND, "s"), "local": (THIRD, "D"), "paper-code": (SIXTH, "v"),
-         "wcsph": (FOURTH, "^"), "transport-velocity": (FIFTH, "P"), "none": ("#b5a642", "X")}
+         "wcsph": (FOURTH, "^"), "transport-velocity": (FIFTH, "P"), "none": ("#b5a642", "X"),
+         "resolved + pairs": (SECOND, "X"), "local + pairs": (THIRD, "p"), "transport-velocity-hand": (FIFTH, "<")}
 OTHERS = list(zip(2 * ("#7b3294", "#e7298a", "#66a61e", "#a6761d", "#1b9e77", "#666633"), ">p<d*8d*8>p<"))  # of others
 GRID, LIGHTEST = "h", 0.55  # marker of grids; share of white in the blue of the coarsest grid
 WIDE = {"color": TRUTH, "linewidth": 2.2}  # a line of the truth, which is seen beside and behind other lines
