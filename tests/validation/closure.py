@@ -110,7 +110,7 @@ def main():
     for run in given.runs:
         case = measure(run)
         side, width = round(case["particles"] ** (1 / 3)), case["filter_width_over_eta"]
-        found[f"{side}³ particles, d = {width:.0f} η"] = case
+        found[f"{side}³ particles, d = {width:.2g} η"] = case
     given.output.mkdir(parents=True, exist_ok=True)
     (given.output / "closure.json").write_text(json.dumps(found, indent=1) + "\n")
     (given.output / "closure.png").write_bytes(png(figure(found)))

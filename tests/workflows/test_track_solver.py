@@ -22,7 +22,7 @@ def test_the_grid_of_a_memory_has_the_planes_that_the_spectrum_of_the_flow_needs
     slab = slabs_for(comm, tracers, resolved, width, kolmogorov_length)
     reference = {"velocity_rms": 1.0, "acceleration_rms": 1.0, "density_mean": 1.0, "viscosity": 0.01,
                  "filter_width": width, "spacing": resolved.spacing, "kolmogorov_length": kolmogorov_length}
-    assert (slab.planes, solver_of(slab, reference, (1, 1, 1), 1.0).grid.resolved) == (planes, highest)
+    assert (slab.planes, solver_of(slab, reference, (1, 1, 1), True, 1.0).grid.resolved) == (planes, highest)
 
 
 def particles_with(ids):

@@ -17,14 +17,15 @@ from eddies.particles.exchanges import fluctuations, mean_over_ranks, relative_e
 from eddies.particles.flow_units import CELLS_PER_WAVENUMBER, ReferenceScales, planes_for, resolved_wavenumber
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.remembered_velocity import RememberedVelocity
-from eddies.particles.resolved_velocity import WEIGHT, ResolvedVelocity
+from eddies.particles.resolved_velocity import TOLERANCE, WEIGHT, ResolvedVelocity
 from eddies.scene.scene import BOX_LENGTH, Reconstruction, Tracers
 
 WEIGHTS = 10.0 ** np.arange(3, -1.1, -0.5)  # weights of the noise in least squares; cross-validation chooses one
 RISE = 1.02             # the search ends when the error exceeds the least error by this factor
 HELD_OUT = 0.1          # share of the particles that cross-validation leaves out
-RESIDUAL = 5e-5         # of a solve, relative to the velocities; with 2e-4 velocity errors of filtered tracks without noise
-                        # are 3, 17 and 35 % larger (8^3, 16^3 and 32^3 tracks of hit-small), with 1e-5 1 % smaller
+# Residual of a solve for filtered tracks, relative to the velocities. With that of other tracks, TOLERANCE, the errors of
+# 8^3, 16^3 and 32^3 filtered tracks of hit-small without noise are 3, 17 and 35 % larger, with 1e-5 1 % smaller.
+RESIDUAL_FILTERED = 5e-5
 NO_FILTER = 1e-3        # filter width divided by the spacing, for an unfiltered flow
 
 
@@ -140,19 +141,20 @@ def slabs_for(comm: Comm, tracers: Tracers, resolved: Tracers, filter_width: flo
     return SlabDecomposition(comm, BOX_LENGTH, min(max(planes, least), most))
 
 
-def solver_of(slab: SlabDecomposition, reference: Mapping[str, float], periods: Sequence[int],
+def solver_of(slab: SlabDecomposition, reference: Mapping[str, float], periods: Sequence[int], filtered: bool,
               weight: float) -> ResolvedVelocity:
-    """Make the least-squares solver with this weight of the noise. Each solve ends at RESIDUAL.
+    """Make the least-squares solver with this weight of the noise. Each solve ends at the same residual.
 
     `reference` holds the reference scales, with the names that they have in ground_truth.h5. The solver does not depend
-    on those of velocity and acceleration, which may be 0. `periods` are those of the flow in the box.
+    on those of velocity and acceleration, which may be 0. `periods` are those of the flow in the box. `filtered` tells
+    whether the tracks follow a filtered velocity.
     """
     scales = ReferenceScales(
         velocity=1.0, acceleration=1.0,
         **{name: reference[name] for name in ("filter_width", "spacing", "density_mean", "viscosity",
                                               "kolmogorov_length")})
     solver = ResolvedVelocity.on_slabs(slab, scales, weight=weight, periods=periods)
-    solver.tolerance = solver.tolerance_predicted = RESIDUAL
+    solver.tolerance = solver.tolerance_predicted = RESIDUAL_FILTERED if filtered else TOLERANCE
     return solver
 
 

@@ -126,7 +126,8 @@ class Source:
         """Return the solver with the best weight of the noise for the surest frame (`best_solver`), this weight, and
         the transfer function of the filter that the particles' velocity has passed; collective."""
         solver, weight, _ = best_solver(self.particles(self.surest),
-                                        partial(solver_of, self.slab, self.scales, self.periods), share, self.uniform)
+                                        partial(solver_of, self.slab, self.scales, self.periods, self.filtered),
+                                        share, self.uniform)
         grid = solver.grid
         transfer = grid.filter_transfer(self.scales["filter_width"]) if self.filtered else torch.ones_like(grid.shell)
         return solver, weight, transfer

@@ -231,9 +231,9 @@ class FittedFlows:
         for resolved in (own, settings.resolving(own, filtered))[:2 if viscosity > 0 else 1]:
             self.slab = slabs_for(tracks.comm, own, resolved, width, self.reference["kolmogorov_length"])
             make = partial(solver_of, self.slab, self.reference | {"spacing": resolved.spacing, "filter_width": width},
-                           tracks.about["periods"])
-            known_best = particles_on(self.slab, tracks.frame(surest(tracks.velocity_errors)))
-            solver, self.weight, self.error = best_solver(known_best, make, uniform=tracks.uniform)
+                           tracks.about["periods"], filtered)
+            clearest = particles_on(self.slab, tracks.frame(surest(tracks.velocity_errors)))
+            solver, self.weight, self.error = best_solver(clearest, make, uniform=tracks.uniform)
             self.grid = solver.grid
             self.method = UniformMethod(solver) if tracks.uniform else LeastSquaresMethod(solver)
             # The velocity_rms is that of the particles.
