@@ -196,6 +196,26 @@ def test_samples_of_a_memory_follow_the_flow(comm):
 
 
 @pytest.mark.mpi(1)
+def test_errors_of_a_memory_are_within_their_standard_deviations(comm):
+    """A flow of the prior that follows the equations of the forecast, and other particles in each frame. The error is
+    halved in five frames."""
+    solver = solver_on(comm)
+    grid = solver.grid
+    memory = RememberedVelocity(solver, 0.01, torch.ones_like(grid.shell), 4.0)
+    flow, samples, found = flow_of(solver, 0, 1.0), ErrorSamples(solver, 16, memory), []
+    for frame in range(6):
+        flow = memory.forecast(flow, 0.01) if frame else flow
+        position = torch.from_numpy(np.random.default_rng(frame).uniform(0, 2 * np.pi, (COUNT, 3)))
+        velocity = grid.at(flow, grid.points(position)) + normal(np.arange(COUNT), frame, 10**6)
+        particles = ParticleSet(torch.arange(COUNT), position, velocity)
+        modes = memory.of(particles, 0.01 * frame)
+        errors = list(samples.of(particles, modes, frame))
+        found.append(float(grid.mean_square(modes - flow)) ** 0.5)
+    assert found[-1] < 0.6 * found[0]
+    assert_honest(shares_within(grid, modes - flow, errors))
+
+
+@pytest.mark.mpi(1)
 def test_particles_that_move_alike_have_no_errors(comm):
     solver = solver_on(comm)
     rows, position = map(torch.from_numpy, places(solver.grid.decomposition))
