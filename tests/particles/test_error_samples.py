@@ -149,7 +149,7 @@ def test_scales_beyond_the_modes_are_carried_along(comm):
     points = solver.grid.points(torch.from_numpy(np.random.default_rng(6).uniform(0, 2 * np.pi, (4000, 3))))
     beyond, weights = UnresolvedScales(solver), carried_weights(0.5)
     drawn = np.stack([beyond.at(points, np.arange(4000), frame, 0, weights).numpy().ravel() for frame in (0, 1, 2, 9)])
-    assert 0.3 < beyond._white < 0.7
+    assert 0.3 < beyond.white < 0.7
     # They are 12000 numbers from as many modes; five standard deviations of a variance are 6 %.
     np.testing.assert_allclose(drawn.var(axis=1), 1, atol=0.14)
     np.testing.assert_allclose(np.corrcoef(drawn)[0, 1:], [np.exp(-1 / 8), np.exp(-1 / 2), 0], atol=0.1)

@@ -1,7 +1,10 @@
 """Random errors of a velocity that least squares estimate: samples of the Gaussian posterior."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -71,10 +74,13 @@ class ErrorSamples:
                  weights: Sequence[float] = ALONE, every: int = 1) -> None:
         self.solver, self.count, self.memory, self.every = solver, count, memory, every
         self.weights = weights if memory else ALONE
-        self._beyond = UnresolvedScales(solver)
         #: c and s^2 without the noise of splines, over the mean square of the velocity fluctuations
         self.levels: np.ndarray | None = None
         self._errors: list[Tensor] = []
+
+    @cached_property
+    def _beyond(self) -> UnresolvedScales:
+        return UnresolvedScales(self.solver)
 
     @torch.no_grad()
     def measure(self, particles: ParticleSet, noise: float = 0.0) -> None:
@@ -180,19 +186,20 @@ class UnresolvedScales:
     def __init__(self, solver: ResolvedVelocity) -> None:
         slab, own = solver.grid.decomposition, solver.grid
         highest = (slab.planes - 1) // 2
-        self.grid, self._white = None, 1.0
-        if highest > own.resolved:
-            self.grid = grid = FourierGrid(slab, highest, round(own.reach / slab.spacing), own.dtype)
-            inside = (grid.shell > own.resolved) & (grid.shell <= highest) & grid.repeating(solver.periods)
+        self.grid = grid = FourierGrid(slab, highest, round(own.reach / slab.spacing), own.dtype)
+        inside = (grid.shell > own.resolved) & (grid.shell <= highest) & grid.repeating(solver.periods)
+        #: share of the energy that is white noise
+        self.white, self._amplitude = 1.0, None
+        if global_sum(slab.comm, float(inside.sum())) > 0:
             energy, rest = solver.expected_energy(grid, inside)
-            self._white = rest / solver.expected_energy(own, own.shell > 0)[1]
-            self._amplitude = (3 * (1 - self._white) * energy).sqrt()
+            self.white = rest / solver.expected_energy(own, own.shell > 0)[1]
+            self._amplitude = (3 * (1 - self.white) * energy).sqrt()
 
     def at(self, points: Points, ids: np.ndarray, frame: int, sample: int,
            weights: Sequence[float] = ALONE) -> Tensor:
         """Return the velocities (n, 3) at points of the solver's grid; `weights` as in `white_modes`. Collective."""
-        found = math.sqrt(self._white) * normal(ids, frame, sample, weights)
-        if self.grid is None:
+        found = math.sqrt(self.white) * normal(ids, frame, sample, weights)
+        if self._amplitude is None:
             return found
         modes = self.grid.solenoidal(white_modes(self.grid, frame, sample, weights))
         return found + self.grid.at(self._amplitude * modes, points)

@@ -130,7 +130,7 @@ class RememberedVelocity:
 
     @property
     def _highest(self) -> float:
-        """k_c"""
+        """k_c, the wavenumber of the highest modes."""
         return self.solver.grid.resolved * 2 * math.pi / self.solver.grid.decomposition.length
 
     def _change(self, whole: Tensor) -> Tensor:
