@@ -72,11 +72,13 @@ def test_a_table_has_the_rows_and_columns_that_its_comment_names(tables, tmp_pat
 def test_a_table_without_rows_has_all_and_one_may_have_rows_of_others(tables, tmp_path, monkeypatch):
     (tmp_path / "results").mkdir()
     (tmp_path / "results/own.json").write_text(json.dumps(RECORD))
-    (tmp_path / "results/other-0.08.json").write_text(json.dumps({"rows": [{"name": "one", "energy_ratio": "stopped"}]}))
+    other = {"rows": [{"name": "one", "energy_ratio": "stopped"}]}
+    (tmp_path / "results/other-0.08.json").write_text(json.dumps(other))
     monkeypatch.setattr(tables, "HERE", tmp_path)
     page = "<!-- table of {}: energy_ratio\n{}-->\n{}<!-- end of table -->"
     head = "| | energy, model / truth |\n|---|---|\n"
-    assert tables.written(page.format("own", "", "")) == page.format("own", "", head + "| `one` | 0.996 |\n| `two` |  |\n")
+    lines = head + "| `one` | 0.996 |\n| `two` |  |\n"
+    assert tables.written(page.format("own", "", "")) == page.format("own", "", lines)
     rows = "one: here\nother-0.08/one: there\n"
     assert tables.written(page.format("own", rows, "")) == page.format(
         "own", rows, head + "| here | 0.996 |\n| there | stopped |\n")

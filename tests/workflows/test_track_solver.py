@@ -53,5 +53,6 @@ def test_ids_in_the_upper_bits_have_an_error_of_validation(comm):
     slab = slabs_for(comm, tracers, tracers, 1e-3 * tracers.spacing, 0.0)
     reference = {"velocity_rms": 0.7, "acceleration_rms": 1.0, "density_mean": 1.0, "viscosity": 0.0,
                  "filter_width": 1e-3 * tracers.spacing, "spacing": tracers.spacing, "kolmogorov_length": 0.0}
-    _, _, error = best_solver(particles_with(2**32 * np.arange(512)), partial(solver_of, slab, reference, (1, 1, 1), False))
+    make = partial(solver_of, slab, reference, (1, 1, 1), False)
+    _, _, error = best_solver(particles_with(2**32 * np.arange(512)), make)
     assert 0 < error < 0.2

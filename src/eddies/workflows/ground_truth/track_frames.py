@@ -184,8 +184,8 @@ def _read_measured(settings: Settings, versions: tuple[FileVersion, ...]) -> Mea
         log.warning("%s: all tracks move alike%s: the velocity field is uniform, and there are no errors relative to "
                     "its fluctuation", settings.file, "" if background is None else " beside the background")
     errors = np.sqrt(np.add.reduceat(errors, found.starts[:-1]) / np.diff(found.starts)[:, None]) / unit
-    return MeasuredTracks(times, found.starts, columns, errors, weights, background, uniform, (counts == len(times))[place],
-                          spacing, about | {"length_unit": unit, "corner": corner, "periods": periods})
+    return MeasuredTracks(times, found.starts, columns, errors, weights, background, uniform,
+                          (counts == len(times))[place], spacing, about | {"length_unit": unit, "corner": corner, "periods": periods})
 
 
 def _smoothed(found: Tracks, period: float | None, interval: float, settings: Settings,
@@ -222,8 +222,9 @@ def _smoothed(found: Tracks, period: float | None, interval: float, settings: Se
     for what, count in counts.items():
         if count:
             log.info("%s: %d %s", file, count, what)
-    return Tracks(np.rint(splines.time[order] / interval) * interval, splines.track[order], splines.position[order],
-                  splines.velocity[order], None if found.density is None else found.density[rows]), noise, errors, splines.error_weights
+    tracks = Tracks(np.rint(splines.time[order] / interval) * interval, splines.track[order], splines.position[order],
+                    splines.velocity[order], None if found.density is None else found.density[rows])
+    return tracks, noise, errors, splines.error_weights
 
 
 def _continuous(found: Tracks, edge: float, noise: float) -> bool:
