@@ -184,8 +184,9 @@ def _read_measured(settings: Settings, versions: tuple[FileVersion, ...]) -> Mea
         log.warning("%s: all tracks move alike%s: the velocity field is uniform, and there are no errors relative to "
                     "its fluctuation", settings.file, "" if background is None else " beside the background")
     errors = np.sqrt(np.add.reduceat(errors, found.starts[:-1]) / np.diff(found.starts)[:, None]) / unit
+    about |= {"length_unit": unit, "corner": corner, "periods": periods}
     return MeasuredTracks(times, found.starts, columns, errors, weights, background, uniform,
-                          (counts == len(times))[place], spacing, about | {"length_unit": unit, "corner": corner, "periods": periods})
+                          (counts == len(times))[place], spacing, about)
 
 
 def _smoothed(found: Tracks, period: float | None, interval: float, settings: Settings,
