@@ -37,16 +37,16 @@ STORED = ("acceleration_error", "velocity_error_early", "velocity_error_half", "
           "energy_ratio", "spectrum_error", "count_variance")
 
 
-def rounded(value: float) -> float:
+def rounded(value: float | None) -> float | None:
     """The digits that are stored."""
-    return float(f"{value:.5g}")
+    return None if value is None else float(f"{value:.5g}")
 
 
 def measures_of(directory: Path) -> dict[str, float | None]:
     """The measures of a rollout, and the time at which it broke off."""
     found, _ = read(directory, MPI.COMM_SELF)
     numbers = found["rollout"] | found["accuracy"]
-    row = {name: None if numbers.get(name) is None else rounded(numbers[name]) for name in STORED}
+    row = {name: rounded(numbers.get(name)) for name in STORED}
     return row if numbers["stable"] else row | {"plane_difference": None, "broken": rounded(numbers["turnovers"])}
 
 

@@ -10,8 +10,9 @@ import pytest
 from eddies import open_run, run, write_tracks
 from eddies.io.errors import ProductError
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.error_samples import ErrorSamples
 from eddies.scene.scene import SceneError, load_scene
-from eddies.workflows import export, tracks
+from eddies.workflows import export, reconstruct, tracks
 from eddies.workflows.diff import numbers_of
 from eddies.workflows.ground_truth.track_frames import read_measured
 from tests.commands import first_rank
@@ -78,12 +79,18 @@ def test_a_ground_truth_of_tracks_is_that_of_the_flow(comm, twin, tmp_path):
             assert own["reference"].attrs[name] == pytest.approx(true["reference"].attrs[name], rel=0.1)
 
 
-@pytest.mark.mpi(1)
-def test_noise_costs_less_with_smoothing(comm, twin, tmp_path):
+def noisy(twin, path):
+    """Write the tracks with noise to a table; returns the standard deviation of a coordinate."""
     rows = np.loadtxt(twin / "tracks.csv", delimiter=",", skiprows=1)
     noise = 0.005 * MILLIMETRES / 10  # a two-hundredth of the mean spacing, and half of a displacement
     rows[:, 2:] = (rows[:, 2:] + noise * np.random.default_rng(2).standard_normal(rows[:, 2:].shape)) % MILLIMETRES
-    np.savetxt(tmp_path / "noisy.csv", rows, delimiter=",", header="track,time,x,y,z", comments="", fmt="%.15g")
+    np.savetxt(path, rows, delimiter=",", header="track,time,x,y,z", comments="", fmt="%.15g")
+    return noise
+
+
+@pytest.mark.mpi(1)
+def test_noise_costs_less_with_smoothing(comm, twin, tmp_path):
+    noise = noisy(twin, tmp_path / "noisy.csv")
     with h5py.File(twin / "ground_truth.h5") as file:
         true = file["particles/tracers/velocity/value"][:, 20:]
     errors = {}
@@ -93,6 +100,32 @@ def test_noise_costs_less_with_smoothing(comm, twin, tmp_path):
         velocity = np.stack([found.frame(frame, complete=True)["velocity"] for frame in range(len(found.times))])
         errors[given] = relative(velocity, true)
     assert errors[noise] < 0.2 < 0.4 * errors[0.0]
+
+
+@pytest.mark.mpi(1)
+def test_the_error_map_of_noisy_tracks_knows_their_splines(comm, twin, tmp_path, monkeypatch):
+    made = []
+
+    class Recorded(ErrorSamples):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            made.append(self)
+
+    monkeypatch.setattr(reconstruct, "ErrorSamples", Recorded)
+    noise = noisy(twin, tmp_path / "noisy.csv")
+    scene = scene_of(comm, tmp_path, SECTION.format(path="noisy.csv", unit=MILLISECONDS) + f"""noise = {noise}
+viscosity = 0.01
+[reconstruction]
+method = "memory"
+samples = 1
+every = 2
+holdout = 0
+""")
+    run(scene, stages=["dns", "reconstruct"], output=tmp_path / "run", comm=comm)
+    weights = read_measured(scene.tracks).error_weights
+    assert len(weights) > 3 and np.sum(weights**2) == pytest.approx(1)
+    np.testing.assert_array_equal(made[0].weights, weights)
+    assert made[0].every == 2
 
 
 @pytest.mark.mpi(1)

@@ -111,11 +111,11 @@ def smooth(time: np.ndarray, track: np.ndarray, position: np.ndarray, edge: floa
 
 
 def error_weights(smoothing: float, rows: int) -> np.ndarray:
-    """Return how the error of a velocity in the middle of a track of so many rows is made of the errors of successive
-    positions, which are independent.
+    """Return weights of successive positions. The sum of the errors of these positions with the weights is the error of
+    the velocity of a spline in the middle of a track with this number of rows, up to a factor.
 
-    The sum of squares of these weights is 1, and their autocorrelation is that of the errors of successive velocities.
-    Rows that are far for a spline with mu = `smoothing` have no weight.
+    The sum of the squared weights is 1. Their autocorrelation is that of the errors of successive velocities. Rows that
+    are far for a spline with mu = `smoothing` have no weight.
     """
     rows = min(rows, 2 * ceil(FAR * (1 + smoothing ** (1 / 6))) + 1)
     fit = Fit(np.arange(float(rows)), np.zeros((1, rows, 3)), 1.0)

@@ -66,7 +66,7 @@ class ErrorSamples:
     solver : estimates the velocity, or the first frame of a `memory`. Its penalty is the prior.
     count : number of samples.
     memory : the method that estimates the frames, if it has a memory.
-    weights : `error_weights` of splines. Without a memory frames are independent.
+    weights : `error_weights` of splines. Only a memory needs them: without one, frames are independent.
     every : number of frames from one estimate to the next.
     """
 
@@ -192,7 +192,7 @@ class UnresolvedScales:
         self.white, self._amplitude = 1.0, None
         if global_sum(slab.comm, float(inside.sum())) > 0:
             energy, rest = solver.expected_energy(grid, inside)
-            self.white = rest / solver.expected_energy(own, own.shell > 0)[1]
+            self.white = rest / solver.unresolved
             self._amplitude = (3 * (1 - self.white) * energy).sqrt()
 
     def at(self, points: Points, ids: np.ndarray, frame: int, sample: int,

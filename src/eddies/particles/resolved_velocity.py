@@ -179,8 +179,9 @@ class ResolvedVelocity:
         self.expected_energy = partial(expected_energy, filter_width=filter_width, kolmogorov_length=kolmogorov_length)
         inside = (grid.shell <= grid.resolved) & grid.repeating(periods)
         penalized = (grid.shell > 0) & inside
-        energy, unresolved = self.expected_energy(grid, penalized)
-        penalty = torch.where(penalized, weight * unresolved / (3 * torch.where(penalized, energy, 1.0)), 0.0)
+        #: expected energy beyond k_c, in units of <v.v>
+        energy, self.unresolved = self.expected_energy(grid, penalized)
+        penalty = torch.where(penalized, weight * self.unresolved / (3 * torch.where(penalized, energy, 1.0)), 0.0)
         self.equations = LeastSquares(grid, inside, penalty)
         self.forget()
 

@@ -24,7 +24,7 @@ WEIGHTS = 10.0 ** np.arange(3, -1.1, -0.5)  # weights of the noise in least squa
 RISE = 1.02             # the search ends when the error exceeds the least error by this factor
 HELD_OUT = 0.1          # share of the particles that cross-validation leaves out
 # Residual of a solve for filtered tracks, relative to the velocities. With TOLERANCE, that of other tracks, errors of
-# 8^3, 16^3 and 32^3 filtered tracks of hit-small without noise are 3, 17 and 35 % larger, with 1e-5 1 % smaller.
+# 8^3, 16^3 and 32^3 filtered tracks of hit-small without noise are 3, 17 and 33 % larger, with 1e-5 1 to 4 % smaller.
 RESIDUAL_FILTERED = 5e-5
 NO_FILTER = 1e-3        # filter width divided by the spacing, for an unfiltered flow
 
