@@ -105,6 +105,7 @@ def test_a_flow_and_tracks_are_those_of_their_files(comm, tmp_path, capfd):
             file[f"state_phys/v{name}"] = component
         file.create_group("info_simul/params/oper").attrs.update(dict.fromkeys(("Lx", "Ly", "Lz"), 1.0))
     scene = 'base = "taylor-green"\nflow.viscosity = 0.02\ninitial.kind = "file"\ninitial.path = "state.h5"\n'
+    scene += 'tracers = {particles_per_side = 5, turnovers = 0.1, frame_interval = 0.05}\nunset = ["time.duration"]\n'
     assert main(["check", str(scene_file(tmp_path, scene)), "--json"]) == 0
     output, errors = capfd.readouterr()
     found = json.loads(output)
@@ -113,6 +114,7 @@ def test_a_flow_and_tracks_are_those_of_their_files(comm, tmp_path, capfd):
     assert found["turbulence"]["dissipation_rate"] == pytest.approx(0.03, rel=1e-6)
     assert found["turbulence"]["eddy_turnover_time"] == pytest.approx(3 * np.pi / 4 / np.sqrt(0.5), rel=1e-6)
     assert "divergence" in errors
+    assert any("filter_width = 2.51: is wider than the integral scale, 2.36" in line for line in found["warnings"])
     time, start = np.repeat([0, 1, 2], 30), np.random.default_rng(1).uniform(0.1, 0.9, (30, 3))
     write_tracks(tmp_path / "a.h5", time, np.tile(np.arange(30), 3), np.tile(start, (3, 1)) + 0.01 * time[:, None],
                  np.full((90, 3), 0.01))

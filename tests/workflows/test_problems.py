@@ -68,7 +68,7 @@ def test_a_rollout_within_the_training_of_its_model_is_named(comm, name, changes
     ("time.step=0.06", "unstable by advection, step x k_max x max(|u| + |v| + |w|) = 3.17, stable up to 2.83",
      "time.step=0.05"),
     ("time.courant=2.5", "[time] courant = 2.5: is unstable by advection", None),
-    ("tracers.filter_width=2", "passes wavenumbers up to 1.6", "tracers.filter_width={lower it to}"),
+    ("tracers.filter_width=2", "wider than the integral scale, 1.25", "tracers.filter_width={lower it to}"),
     ("tracers.filter_width=0.1", "narrower than a cell", "tracers.filter_width={raise it to}"),
     ("simulation.turnovers=5", "ends 0.3 turnovers after the start", "simulation.turnovers={lower it to}"),
     ("simulation.turnovers=5", "[simulation] turnovers = 5", "tracers.turnovers={raise .tracers. turnovers to}"),

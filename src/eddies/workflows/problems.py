@@ -258,7 +258,7 @@ def _warnings(step: Step, made: Collection[Path], measured: Measured) -> Iterato
         yield from compressibility(scene.flow, expected.rms_speed)
         yield from stability(scene.flow, scene.time, expected)
         for each in tracers.all if tracers is not None else ():
-            yield from filter_width(each, scene.flow, scene.initial, scene.forcing)
+            yield from filter_width(each, scene.flow, expected.scales)
     if "reconstruct" in stages:
         yield from spoiled_quantities(scene.reconstruction, (scene.tracks or tracers).filtered, scene.tracks)
     if "train" in stages and training is not None:
@@ -360,18 +360,17 @@ def stability(flow: Flow, time: Time, expected: Estimates) -> Iterator[str]:
             yield f"[time] {key} = {getattr(time, key):g}: is unstable by {limit}; {REMEDIES[limit.name]}"
 
 
-def filter_width(tracers: Tracers, flow: Flow, initial: Initial, forcing: Forcing | None) -> Iterator[str]:
-    """Yield a warning if the filter is narrower than a cell, or so wide that it removes the energy of the flow."""
+def filter_width(tracers: Tracers, flow: Flow, scales: Mapping[str, float] | None) -> Iterator[str]:
+    """Yield a warning if the filter is narrower than a cell, or wider than the integral scale, so that it removes most
+    of the energy. `scales` are those of the turbulence, if known."""
     width, cell = tracers.filter_width, BOX_LENGTH / flow.cells
     if width < cell:
         yield (f"[tracers] filter_width = {width:.3g}: is narrower than a cell of the grid, so that nothing is "
                f"filtered; raise it to {at_least(cell)} or more")
-    if forcing or initial.flow.turbulent:
-        highest = forcing.wavenumber if forcing else initial.peak_wavenumber
-        if math.pi / width < highest * (1 - 1e-9):
-            yield (f"[tracers] filter_width = {width:.3g}: passes wavenumbers up to {math.pi / width:.2g}, but the "
-                   f"energy is at {highest:g}; lower it to {at_most(math.pi / highest)} or less, or raise "
-                   "particles_per_side")
+    if scales is not None and width > scales["integral_scale"] * (1 + 1e-9):
+        yield (f"[tracers] filter_width = {width:.3g}: is wider than the integral scale, "
+               f"{scales['integral_scale']:.3g}, so that the filter removes most of the energy; lower it to "
+               f"{at_most(scales['integral_scale'])} or less, or raise particles_per_side")
 
 
 def spoiled_quantities(settings: Reconstruction, filtered: bool, tracks: Tracks | None) -> Iterator[str]:
