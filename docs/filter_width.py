@@ -1,7 +1,6 @@
 """Figure of the error over the filter width in Kolmogorov lengths, from the results of several comparisons.
 
-    .venv/bin/python tests/benchmarks/filter_width.py docs/results/compare-small.json docs/results/compare-hit.json \
-        docs/results/compare-coarse.json docs/results/compare-256.json docs/error-over-filter-width.png
+    .venv/bin/python docs/filter_width.py
 
 It shows the variants of the same names in all comparisons, and the best coarse grids: those with the smallest error of
 all that take no longer than the resolved velocity in the same run, once with exact modes of the flow at the start, once
@@ -10,17 +9,19 @@ with modes found in the velocities of the particles.
 
 import json
 import math
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from pictures import save
 
 from eddies.measures import MEASURES
 from eddies.report.summary import in_symbols, is_stable
-from eddies.report.figures import BLUE, FILTERED, GRID, LOOKS, letter, panels, png, styled
+from eddies.report.figures import BLUE, FILTERED, GRID, LOOKS, letter, panels, styled
 
+HERE = Path(__file__).parent
+COMPARISONS = "small", "hit", "coarse", "256"
 DRAWN = ("velocity_error_half", "acceleration_kl")
 # Label, colour and marker of the variants.
 MARKERS = {"resolved": ("resolved", *LOOKS["resolved"]),
@@ -86,9 +87,8 @@ def drawn(results: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 if __name__ == "__main__":
-    *sources, target = map(Path, sys.argv[1:])
-    given = [json.loads(source.read_text()) for source in sources]
+    given = [json.loads((HERE / f"results/compare-{name}.json").read_text()) for name in COMPARISONS]
     for each in DRAWN:
         for start in "grid", "grid-particles":
             print(each, *(f"d/eta {at:.1f}: {name} {error:.3g}" for at, error, _, name in points(given, start, each)))
-    target.write_bytes(png(drawn(given)))
+    save(HERE / "error-over-filter-width.png", drawn(given))
