@@ -361,7 +361,7 @@ def stability(flow: Flow, time: Time, expected: Estimates) -> Iterator[str]:
 
 
 def filter_width(tracers: Tracers, flow: Flow, scales: Mapping[str, float] | None) -> Iterator[str]:
-    """Yield a warning if the filter is narrower than a cell, or wider than the integral scale, so that it removes most
+    """Yield a warning if the filter is narrower than a cell, or wider than the integral scale, so that it removes much
     of the energy. `scales` are those of the turbulence, if known."""
     width, cell = tracers.filter_width, BOX_LENGTH / flow.cells
     if width < cell:
@@ -369,7 +369,7 @@ def filter_width(tracers: Tracers, flow: Flow, scales: Mapping[str, float] | Non
                f"filtered; raise it to {at_least(cell)} or more")
     if scales is not None and width > scales["integral_scale"] * (1 + 1e-9):
         yield (f"[tracers] filter_width = {width:.3g}: is wider than the integral scale, "
-               f"{scales['integral_scale']:.3g}, so that the filter removes most of the energy; lower it to "
+               f"{scales['integral_scale']:.3g}, so that the filter removes much of the energy; lower it to "
                f"{at_most(scales['integral_scale'])} or less, or raise particles_per_side")
 
 
