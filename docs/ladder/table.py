@@ -1,8 +1,8 @@
-"""Writes the results of a run of the ladder, of its choices or its widths: each variant on the flows of the test.
+"""Writes the results of a run of the ladder, of its choices or of other filters: each variant on the flows of the test.
 
     .venv/bin/python docs/ladder/table.py runs/ladder [--seconds]
 
-Realisation 2 serves the choice, the others the test, whose mean and standard deviation stand in the tables of the page
+Realisation 2 of the ladder serves the choice, all others the test, whose mean and standard deviation stand in the tables of the page
 (`docs/tables.py`). With `--seconds` the seconds of a turnover are measured, all rungs in turn on one core, else they
 are those of the last measurement. Writes ../results/RUN.json, and for the ladder the figure ../paper/ladder.png: error
 at T over the cost of a turnover.
@@ -74,9 +74,8 @@ def seconds_of(scene: Scene, directory: Path, step: TimeStep, truth: Path) -> fl
         return (time.perf_counter() - began) / (run.time - start) * opened.reference["eddy_turnover_time"]
 
 
-def combined(flows: dict[str, dict]) -> dict[str, float | str | None]:
-    """Means and standard deviations over the flows of the test; a word on rollouts that broke off."""
-    rows = [row for name, row in flows.items() if name != CHOICE]
+def combined(rows: list[dict]) -> dict[str, float | str | None]:
+    """Means and standard deviations over flows; a word on rollouts that broke off."""
     broken = [row["broken"] for row in rows if "broken" in row]
     found: dict[str, float | str | None] = {}
     for key in STORED:
@@ -136,7 +135,8 @@ def main(run: Path, timed: bool) -> None:
         if math.isfinite(seconds):
             row["wall_seconds"] = rounded(seconds)
         flows = {path.name: measures_of(path) for path in paths}
-        rows.append(row | combined(flows) | {"flows": flows})
+        tested = [found for flow, found in flows.items() if run.name != "ladder" or flow != CHOICE]
+        rows.append(row | combined(tested) | {"flows": flows})
     results.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
     if run.name == "ladder":
         FIGURE.write_bytes(png(figure(rows)))
