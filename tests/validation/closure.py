@@ -24,7 +24,8 @@ from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.model import build_model
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import WEIGHT, ResolvedVelocity
-from eddies.report.figures import BLUE, DNS, FOURTH, GUIDE, MODEL, SECOND, letter, panels, png, styled
+from eddies.report.figures import (BLUE, DNS, FOURTH, GUIDE, MODEL, SECOND, legend_at_foot, letter, panels,
+                                   plain_log_ticks, png, styled)
 from eddies.scene.terms import Pressure, Stress, Viscosity
 from eddies.workflows.ground_truth.truth import GroundTruth
 
@@ -79,25 +80,26 @@ def measure(path, shares=SHARES, iterations=ITERATIONS):
 @styled
 def figure(found):
     """Errors over k_c, a panel each, and over iterations."""
-    drawn, axes = panels(1, len(found) + 1, (3.4, 3.1))
+    drawn, axes = panels(-(-(len(found) + 1) // 2), 2, (4.6, 3.1))
+    *cases, solved = axes.flat[:len(found) + 1]
     markers = iter(("o-", "s--", "^:"))
-    for (name, case), axis in zip(found.items(), axes[0]):
+    for (name, case), axis in zip(found.items(), cases):
         share = np.array(case["highest"]) / case["nyquist"]
         for weight, colour in WEIGHTS.items():
             errors = np.array(case["by_weight"][f"{weight:g}"])[:, 0]
             axis.plot(share, errors, "o-", color=colour, markersize=3.5, label=f"weight {weight:g}")
         axis.plot(share, np.array(case["gradient"])[:, 0], "s--", color=BLUE, markersize=3.5, label="gradient stress")
         axis.axvline(case["chosen"] / case["nyquist"], color=GUIDE, linewidth=0.8, label="the choice")
-        axis.set(yscale="log", xlabel="$k_c$ / Nyquist wavenumber", title=name)
-        axes[0, -1].plot(case["iterations"], case["by_iterations"], next(markers), color=DNS, markersize=4,
-                         label=name.split(", ")[-1])
-    axes[0, 0].set_ylabel("error of the acceleration")
-    axes[0, 0].legend()
-    axes[0, -1].set(xscale="log", yscale="log", xlabel="iterations from zero", title="at the chosen $k_c$")
-    axes[0, -1].set_xticks([2, 4, 8, 16, 32, 64], [2, 4, 8, 16, 32, 64])
-    axes[0, -1].minorticks_off()
-    axes[0, -1].legend(loc="upper right")
-    letter(axes[0])
+        axis.set(yscale="log", xlabel="$k_c$ / Nyquist wavenumber", ylabel="error of the acceleration", title=name)
+        solved.plot(case["iterations"], case["by_iterations"], next(markers), color=DNS, markersize=4,
+                    label=name.split(", ")[-1])
+    solved.set(xscale="log", yscale="log", xlabel="iterations from zero", title="at the choice of $k_c$")
+    solved.set_xticks([2, 4, 8, 16, 32, 64], [2, 4, 8, 16, 32, 64])
+    solved.minorticks_off()
+    solved.legend(loc="upper right")
+    plain_log_ticks(*(axis.yaxis for axis in axes.flat))
+    letter([*cases, solved])
+    legend_at_foot(drawn, cases[0])
     return drawn
 
 
@@ -109,8 +111,7 @@ def main():
     found = {}
     for run in given.runs:
         case = measure(run)
-        side, width = round(case["particles"] ** (1 / 3)), case["filter_width_over_eta"]
-        found[f"{side}³ particles, d = {width:.2g} η"] = case
+        found[f"{run.name}, d = {case['filter_width_over_eta']:.2g} η"] = case
     given.output.mkdir(parents=True, exist_ok=True)
     (given.output / "closure.json").write_text(json.dumps(found, indent=1) + "\n")
     (given.output / "closure.png").write_bytes(png(figure(found)))
