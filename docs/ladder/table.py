@@ -2,10 +2,10 @@
 
     .venv/bin/python docs/ladder/table.py runs/ladder [--seconds]
 
-Realisation 2 of the ladder serves the choice, all others the test, whose mean and standard deviation stand in the tables of the page
-(`docs/tables.py`). With `--seconds` the seconds of a turnover are measured, all rungs in turn on one core, else they
-are those of the last measurement. Writes ../results/RUN.json, and for the ladder the figure ../paper/ladder.png: error
-at T over the cost of a turnover.
+Realisation 2 of the ladder serves the choice, all others the test, whose mean and standard deviation stand in the
+tables of the page (`docs/tables.py`). With `--seconds` the seconds of a turnover are measured, all rungs in turn on one
+core, else they are those of the last measurement. Writes ../results/RUN.json, and for the ladder the figure
+../paper/ladder.png: error at T over the cost of a turnover.
 """
 
 import argparse

@@ -97,7 +97,9 @@ def figure(found):
     solved.set_xticks([2, 4, 8, 16, 32, 64], [2, 4, 8, 16, 32, 64])
     solved.minorticks_off()
     solved.legend(loc="upper right")
-    plain_log_ticks(*(axis.yaxis for axis in axes.flat))
+    plain_log_ticks(*(axis.yaxis for axis in (*cases, solved)))
+    for unused in axes.flat[len(found) + 1:]:
+        unused.set_axis_off()
     letter([*cases, solved])
     legend_at_foot(drawn, cases[0])
     return drawn
