@@ -170,6 +170,7 @@ def test_scales_are_those_of_the_release_however_long_the_flow_is_followed(comm,
             release = truth.scales
     assert truth.has_density == (name == TINY) == (release.sound_speed is not None)
     assert len(trajectory.times) > 2 and scales[0] == scales[1]
+    assert scales[0].keys().isdisjoint({"time", "seconds_per_step", "surplus_load"})
     rates = {"velocity": ("acceleration", columns["velocity"][0].mean(axis=0)), "density": ("density_rate", 1.0)}
     for column, values in columns.items():
         rate, mean = rates[column]

@@ -249,5 +249,5 @@ def write_final_fields(file: File, flow: FlowRun) -> None:
 
 def scales_of(sample: dict[str, float]) -> dict[str, float]:
     """Return the entries of a sample that describe the flow, without the entries that describe the run."""
-    of_the_run = ("time", "turnovers", "time_step", "seconds_per_step")
+    of_the_run = ("time", "turnovers", "time_step", "seconds_per_step", "surplus_load")
     return {name: value for name, value in sample.items() if name not in of_the_run}
