@@ -1,6 +1,7 @@
 """Measured tracks in the place of a direct simulation; here they are the tracers of one, so the truth is known."""
 
 import json
+import re
 from dataclasses import replace
 
 import h5py
@@ -319,7 +320,10 @@ fields = ["velocity", "acceleration", "pressure", "dissipation"]
 points = "points.csv"
 """)
     assert scene.stages == ("dns", "reconstruct", "report")
+    caplog.set_level("DEBUG", "eddies")
     run(scene, output=tmp_path / "run", comm=comm)
+    for method in ("least-squares", "memory", "neighbours"):
+        assert re.search(rf"frame \d+  {method} for left-out tracks .* left$", caplog.text, re.MULTILINE)
     stored = open_run(tmp_path / "run")
     numbers = stored.metrics["reconstruction"]
     assert 0 < numbers["validation_error"] < 0.2

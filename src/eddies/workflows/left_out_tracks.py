@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from eddies.clock import ProgressLine
 from eddies.io.hdf5 import File
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
@@ -70,13 +71,19 @@ def _by_modes(scene: Scene, source: Source, frames: range) -> Iterator[tuple[Row
     settings, comm = scene.reconstruction, source.slab.comm
     solver, weight, transfer = source.fitted(settings.holdout)
     method = solving_method(settings, solver, scene.flow.viscosity, transfer, weight)
-    for frame in frames:
+    progress = _progress(settings.method)
+    for number, frame in enumerate(frames, 1):
         known, apart = split(source.particles(frame), settings.holdout)
         modes = method.of(known, float(source.times[frame]))
+        progress(number / len(frames), number)
         if frame >= frames[len(frames) // 2]:
             with torch.no_grad():
                 estimate = solver.grid.at(modes, solver.grid.points(apart.position))
             yield _gathered(comm, known), _gathered(comm, apart, estimate=as_numpy(estimate))
+
+
+def _progress(method: str) -> ProgressLine:
+    return ProgressLine("reconstruct", lambda: f"{method} for left-out tracks", unit="frame")
 
 
 def _gathered(comm: Comm, particles: ParticleSet, **columns: np.ndarray) -> Rows:
@@ -94,7 +101,8 @@ def _errors(scene: Scene, source: Source, methods: tuple[str, ...], found: list[
     slab = SlabDecomposition(alone, BOX_LENGTH, source.slab.planes)
     form = Form("kriging", kernel_of(scene.tracers), scene.tracers.filter_width)
     rows: list[dict[str, float]] = []
-    for each in zip(*found):
+    progress = _progress("neighbours")
+    for number, each in enumerate(zip(*found), 1):
         known, apart = each[0]
         if len(apart["id"]) < LEAST_TRACKS:
             continue
@@ -112,6 +120,7 @@ def _errors(scene: Scene, source: Source, methods: tuple[str, ...], found: list[
             missed["floor"] = source.velocity_noise * np.sqrt(exact.size)
         rows.append({"tracks": float(len(exact)), **{
             name: float(value / size) if size > 0 else np.nan for name, value in missed.items()}})
+        progress(number / len(found[0]), number)
     means = {name: float(np.mean([row[name] for row in rows])) for name in (rows[0] if rows else ())}
     return {name: value for name, value in means.items() if np.isfinite(value)}
 
