@@ -322,8 +322,8 @@ points = "points.csv"
     assert scene.stages == ("dns", "reconstruct", "report")
     caplog.set_level("DEBUG", "eddies")
     run(scene, output=tmp_path / "run", comm=comm)
-    for method in ("least-squares", "memory", "neighbours"):
-        assert re.search(rf"frame \d+  {method} for left-out tracks .* left$", caplog.text, re.MULTILINE)
+    for words in ("tracks", *(f"{name} for left-out tracks" for name in ("least-squares", "memory", "neighbours"))):
+        assert re.search(rf"frame \d+  {words}  .* left$", caplog.text, re.MULTILINE)
     stored = open_run(tmp_path / "run")
     numbers = stored.metrics["reconstruction"]
     assert 0 < numbers["validation_error"] < 0.2

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from eddies.analysis.errors import fluctuations
 from eddies.analysis.isotropic_turbulence import dissipation_constant
+from eddies.clock import ProgressLine
 from eddies.flow.history import UNITS
 from eddies.flow.statistics import component_energies, energy_spectrum, gradient_moments, turbulence_scales
 from eddies.io.fields import FieldWriter
@@ -182,7 +183,9 @@ def write_frames(file: File, flows: FittedFlows, tracks: TrackFrames, tracers: T
                   if count >= LEAST_TRACKS else None)
     fields = FieldWriter(file, "filtered", coarse.cells, {"velocity": 3})
     paths, rows, spectra = [], [], []
+    progress = ProgressLine("dns", lambda: "tracks", unit="frame")
     for frame, time in enumerate(times):
+        progress(frame / len(times), frame)
         if stop is not None:
             stop.check()
         stored = frame % tracers.field_every == 0
