@@ -7,9 +7,9 @@
     mpirun -n 2 .venv/bin/eddies dns tests/validation/tracks-small.toml
     mpirun -n 2 .venv/bin/python tests/validation/twin_tracks.py hit-small runs/tracks-small
 
-The stored results of `hit` are of flows that start from those of `eddies run compare-hit`, seeds 2, 3 and 4, each with
-    --unset spin_up --unset forcing --set initial.kind=file
-    --set initial.path=runs/compare-hit/realisation-2/ground_truth.h5
+The three flows of the stored results of `hit` have the seeds 2, 3 and 4, and start from the realisations 2, 3 and 4 of
+`eddies run compare-hit`. For seed 2 the options are `--unset spin_up --unset forcing --set initial.kind=file --set
+initial.path=runs/compare-hit/realisation-2/ground_truth.h5`.
 
 Writes the tracks of each case as a user would have them, reconstructs them, and compares the fields, after the filter
 of the stored ones, with these. Then forecasts the flow from the first field: the model `resolved` with weights of

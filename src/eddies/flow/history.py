@@ -16,6 +16,8 @@ from eddies.flow.statistics import (
 from eddies.parallel.step_times import surplus_load
 
 EVERY = 4  # steps between two samples
+#: Columns of the run; the others describe the flow.
+OF_THE_RUN = ("turnovers", "time", "time_step", "seconds_per_step", "surplus_load")
 #: Units of the columns of a history; the others are pure numbers.
 UNITS = {"time": "T", "time_step": "T", "seconds_per_step": "s", "eddy_turnover_time": "T", "kolmogorov_time": "T",
          **dict.fromkeys(("energy", "energy_x", "energy_y", "energy_z", "total_energy"), "L^2/T^2"),

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from eddies.clock import ROUND_OFF, Clock, ProgressLine
-from eddies.flow.history import UNITS, FlowHistory
+from eddies.flow.history import OF_THE_RUN, UNITS, FlowHistory
 from eddies.io.checkpoint import Checkpoint, Guard
 from eddies.io.fields import FieldWriter
 from eddies.io.frame_segments import FrameSegments
@@ -249,5 +249,4 @@ def write_final_fields(file: File, flow: FlowRun) -> None:
 
 def scales_of(sample: dict[str, float]) -> dict[str, float]:
     """Return the entries of a sample that describe the flow, without the entries that describe the run."""
-    of_the_run = ("time", "turnovers", "time_step", "seconds_per_step", "surplus_load")
-    return {name: value for name, value in sample.items() if name not in of_the_run}
+    return {name: value for name, value in sample.items() if name not in OF_THE_RUN}
