@@ -9,7 +9,6 @@ results/paper-NAME.json, which are written here.
 """
 
 import json
-import shutil
 import sys
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from mpi4py import MPI
 from pictures import save
+from tables import keep
 
 from eddies import open_run
 from eddies.analysis.pdfs import bin_edges, bin_probabilities, gaussian, kl_divergence, pdf, standardized
@@ -155,7 +155,7 @@ def main(arguments: list[str]) -> None:
     for name, run in runs.items():
         if name == "training":
             continue
-        shutil.copy(run.path / "report/metrics.json", NUMBERS.parent / f"paper-{name}.json")
+        keep(f"paper-{name}", run.path)
     save(HERE / "figure-3.png", figure_3(numbers))
     if "training" in runs:
         shown = runs["training"].figures

@@ -1,6 +1,8 @@
 """Writes the tables of README and docs, results/steps.csv and ladder/choices.csv, from the results beside this file.
 
-    .venv/bin/python docs/tables.py
+    .venv/bin/python docs/tables.py [compare-hit=runs/compare-hit ...]
+
+First the results of the runs that are given as NAME=RUN are kept, as docs/results/NAME.json.
 
 A table stands between two comments. The first names the comparison in docs/results, the columns, and the rows with the
 words for them; a row `floor` is the truth's own, and a row `simulation` has the cost of the direct simulation. Without
@@ -15,7 +17,7 @@ head of the words; words of several cells are separated by ` | `:
     -->
     <!-- end of table -->
 
-The numbers of a run stand likewise, a row each, taken from its `metrics.json` as RUN.json in docs/results:
+The numbers of a run stand likewise, a row each:
 
     <!-- numbers of hit-small
     resolution k_max eta = {ground_truth[kmax_eta]:.2f}
@@ -28,6 +30,7 @@ import io
 import json
 import math
 import re
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -46,6 +49,8 @@ WORDS = MEASURES | {"acceleration_error": "acceleration error", "spectrum_error"
                     "step_integrator": "integrator", "step_size": "step", "step_seconds": "search (s)",
                     "step_error_twice": "error with twice the step", "step_error": "error",
                     "step_error_half": "with half"}
+# What is kept of the metrics of a comparison; of other runs all is kept.
+KEPT = "name", "title", "machine", "flow", "simulation_seconds", "rows", "summary"
 HEADS, FLOOR, SIMULATION, UNMEASURED = "heads", "floor", "simulation", "unmeasured"
 # The choices that the paper leaves open: the file has the words, and these columns of results.
 CHOICES = HERE / "ladder" / "choices.csv"
@@ -55,6 +60,13 @@ STEPS = HERE / "results" / "steps.csv"
 STEPS_OF = "hit-small", "compare-small", "compare-hit", "compare-coarse", "compare-256"
 STEP_COLUMNS = ("step_integrator", "step_size", "step_error_twice", "step_error", "step_error_half", "wall_seconds",
                 "step_seconds")
+
+
+def keep(name: str, run: Path) -> None:
+    """Write the results of a run that has been reported beside the others."""
+    metrics = json.loads((run / "report/metrics.json").read_text(encoding="utf-8"))
+    found = {key: metrics[key] for key in KEPT} if "rows" in metrics else metrics
+    (HERE / "results" / f"{name}.json").write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
 
 
 def written(page: str) -> str:
@@ -142,6 +154,8 @@ def number(row: Mapping[str, Any], key: str) -> str:
 
 
 if __name__ == "__main__":
+    for name, run in (argument.split("=") for argument in sys.argv[1:]):
+        keep(name, Path(run))
     for path in PAGES:
         text = path.read_text(encoding="utf-8")
         if (new := written(text)) != text:

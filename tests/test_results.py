@@ -49,6 +49,19 @@ def test_every_table_is_that_of_its_results(tables):
         assert path.read_text(encoding="utf-8") == written(), ".venv/bin/python docs/tables.py"
 
 
+@pytest.mark.parametrize("metrics, left", [
+    ({"rows": RECORD["rows"], "rollouts": {"one": {}}} | dict.fromkeys(
+        ("name", "title", "machine", "flow", "simulation_seconds", "summary"), "a word"), {"rollouts"}),
+    ({"rollouts": {"one": {}}, "warnings": []}, set())])
+def test_of_a_comparison_the_rows_are_kept_and_of_another_run_all(tables, tmp_path, monkeypatch, metrics, left):
+    for directory in ("run/report", "results"):
+        (tmp_path / directory).mkdir(parents=True)
+    (tmp_path / "run/report/metrics.json").write_text(json.dumps(metrics))
+    monkeypatch.setattr(tables, "HERE", tmp_path)
+    tables.keep("own", tmp_path / "run")
+    assert tables.record_of("own") == {key: value for key, value in metrics.items() if key not in left}
+
+
 def test_numbers_of_a_run_are_those_of_its_metrics(tables, tmp_path, monkeypatch):
     (tmp_path / "results").mkdir()
     record = {"rollout": {"energy_ratio": 0.99584, "bands": {"1-2": 1.25}}}
