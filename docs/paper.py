@@ -43,7 +43,9 @@ PDFS = ({"color": TRUTH, "label": "true accelerations"},
          "label": "accelerations of paper"},
         {"color": GUIDE, "linestyle": ":", "label": "Gaussian"})
 NAMES = "training", "mt008", "mt016", "mt004"
-NUMBERS = Path(__file__).parent / "results/paper-a-priori.json"
+RESULTS = Path(__file__).parent / "results"
+NUMBERS = RESULTS / "paper-a-priori.json"
+MOMENTS = {"quarter": 0.25, "half": 0.5, "end": 1.0}  # parts of a turnover, of which the text has numbers
 
 
 def mach_number(run: StoredRun) -> float:
@@ -107,6 +109,31 @@ def drawn(run: Path, names: list[str]) -> list[Variant]:
     return [Variant(*MODELS[name], *measure.read(run / name, MPI.COMM_SELF)) for name in names]
 
 
+def over_time(found: Variant) -> dict[str, float]:
+    """Divergences, energy over the true one, and variance of counts of a rollout at parts of a turnover that it
+    reached."""
+    tables, turnover, numbers = found.tables, turnover_of([found]), {}
+    errors, model, truth = (tables[name] for name in ("errors", "model", "truth"))
+    for moment, part in MOMENTS.items():
+        row = int(np.argmin(np.abs(errors["time"] - part * turnover)))
+        if errors["time"][row] > (part - 0.05) * turnover:  # else the rollout has broken off
+            numbers |= {f"velocity_kl_{moment}": errors["velocity_kl"][row],
+                        f"acceleration_kl_{moment}": errors["acceleration_kl"][row],
+                        f"energy_ratio_{moment}": model["energy"][row] / truth["energy"][row],
+                        f"count_variance_{moment}": model["count_variance"][row]}
+    return {key: float(f"{value:.5g}") for key, value in numbers.items()}
+
+
+def add(name: str, rollouts: list[Variant]) -> None:
+    """Add the numbers over time to the rows of the results of a run."""
+    path = RESULTS / f"{name}.json"
+    record = json.loads(path.read_text(encoding="utf-8"))
+    found = dict(zip(MODELS, map(over_time, rollouts)))
+    for row in record["rows"]:
+        row |= found.get(row["name"], {})
+    path.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+
+
 @styled
 def figure_8(rows: list[tuple[str, list[Variant], list[StoredRun]]]):
     """Draw energy spectra up to k_d over those of the true tracers, at the times of the rollouts' spectra; a row for
@@ -164,6 +191,8 @@ def main(arguments: list[str]) -> None:
     if not {"mt008", "mt016"} <= {*runs}:
         return
     rollouts = {name: drawn(runs[name].path, [*MODELS]) for name in ("mt016", "mt008")}
+    for name, found in rollouts.items():
+        add(f"paper-{name}", found)
     for number, draw in ((4, velocity_planes), (5, vorticity_and_energy), (6, particle_pdfs), (7, invariant_planes)):
         save(HERE / f"figure-{number}.png", draw(rollouts["mt016"]))
     save(HERE / "figure-8.png", figure_8([(f"$M_t = {mach_number(runs[name]):.2f}$", found,
