@@ -29,7 +29,7 @@ def curves(histories: Mapping[str, tuple[Mapping[str, np.ndarray], str]]) -> Fig
     One training has all its losses, each in a colour. Several have their total losses.
     """
     alone, x = len(histories) == 1, "phases of the training"
-    figure, ((losses, errors),) = panels(1, 2, (5.3, 3.2), below=0.15 * alone)
+    figure, ((losses, errors),) = panels(1, 2, (5.3, 3.2), right=0.3 * alone, below=0.15 * alone)
     for label, (history, colour) in histories.items():
         history = _placed(history)
         for name, words, own in LOSSES if alone else (("loss", label, colour),):
