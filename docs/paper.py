@@ -183,6 +183,7 @@ def main(arguments: list[str]) -> None:
         if name == "training":
             continue
         keep(f"paper-{name}", run.path)
+        add(f"paper-{name}", drawn(run.path, [*MODELS]))
     save(HERE / "figure-3.png", figure_3(numbers))
     if "training" in runs:
         shown = runs["training"].figures
@@ -191,8 +192,6 @@ def main(arguments: list[str]) -> None:
     if not {"mt008", "mt016"} <= {*runs}:
         return
     rollouts = {name: drawn(runs[name].path, [*MODELS]) for name in ("mt016", "mt008")}
-    for name, found in rollouts.items():
-        add(f"paper-{name}", found)
     for number, draw in ((4, velocity_planes), (5, vorticity_and_energy), (6, particle_pdfs), (7, invariant_planes)):
         save(HERE / f"figure-{number}.png", draw(rollouts["mt016"]))
     save(HERE / "figure-8.png", figure_8([(f"$M_t = {mach_number(runs[name]):.2f}$", found,

@@ -176,6 +176,26 @@ def test_a_memory_carries_unresolved_scales_along(comm, monkeypatch):
 
 
 @pytest.mark.mpi(1)
+def test_unresolved_scales_are_carried_along_while_the_angle_changes(comm, monkeypatch):
+    """Angles with one more or one fewer weight on each side, and none in the first frame."""
+    solver, drawn = solver_on(comm), []
+    memory, angles = RememberedVelocity(solver, 0.0, torch.ones_like(solver.grid.shell), 16.0), (
+        0.0, 0.49, 0.51, 0.49)
+    samples, particles = ErrorSamples(solver, 1, memory), velocities_of(solver, flow_of(solver, 0, 1e-2), 0.1)
+    samples.levels, solve = np.array([0.0, 1.0]), samples._error
+    monkeypatch.setattr(samples, "_error", lambda equations, points, noise, *rest: (
+        drawn.append(noise.ravel().numpy()), solve(equations, points, noise, *rest))[1])
+    for frame, angle in enumerate(angles):
+        modes, memory.angle = memory.of(particles, 0.2 * frame), angle
+        list(samples.of(particles, modes, frame))
+    found = [np.corrcoef(drawn[frame:frame + 2])[0, 1] for frame in range(3)]
+    # 1536 numbers: five standard deviations of a correlation of 0.9 are 0.03. The first moment has the draw with the
+    # weight beside the largest one of the second.
+    np.testing.assert_allclose(found[1:], np.exp(-1 / 8), atol=0.03)
+    assert found[0] == pytest.approx(carried_weights(0.49)[4], abs=0.1)
+
+
+@pytest.mark.mpi(1)
 def test_scales_beyond_the_modes_are_carried_along(comm):
     """The variance of a component is 1, less a tenth that splines lose of the highest modes; almost half of it is that
     of modes on the grid. Frames are alike as exp(-(angle lag)^2 / 2)."""

@@ -27,6 +27,7 @@ import eddies
 from eddies.io.hdf5 import open_product
 from eddies.io.track_files import Tracks
 from eddies.scene.scene import load_scene
+from eddies.parallel.stop import StopRequest
 from eddies.workflows import left_out_tracks
 from eddies.workflows.track_source import Source
 from eddies.workflows.tracks import with_tracks
@@ -83,7 +84,7 @@ def errors(name: str, tracks: Tracks, lines: dict[str, str], split: int) -> dict
     left_out_tracks.FRAMES = len(times)
     with open_product(comm, folder / "run/ground_truth.h5", "ground_truth") as file:
         source = Source(scene.tracks, scene.tracers, scene.reconstruction, file, comm)
-        return left_out_tracks.errors_at_left_out(scene, source, file, comm) | {
+        return left_out_tracks.errors_at_left_out(scene, source, file, StopRequest(comm)) | {
             "spacing_over_eta": source.spacing / source.scales["kolmogorov_length"]}
 
 

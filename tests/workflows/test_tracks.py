@@ -11,13 +11,15 @@ import pytest
 from eddies import open_run, run, write_tracks
 from eddies.io.errors import ProductError
 from eddies.parallel.slab import SlabDecomposition
+from eddies.parallel.stop import Stopped
 from eddies.particles.error_samples import ErrorSamples
 from eddies.scene.scene import SceneError, load_scene
-from eddies.workflows import export, reconstruct, tracks
+from eddies.workflows import export, left_out_tracks, reconstruct, tracks
 from eddies.workflows.diff import numbers_of
 from eddies.workflows.ground_truth.track_frames import read_measured
 from tests.commands import first_rank
 from tests.workflows.small_rollout import prepared
+from tests.workflows.stopping import StopAtStep
 
 MILLIMETRES, MILLISECONDS = 20.0, 4.0  # edge of the box, and the time unit of the file in that of the flow
 ARRAYS = {"pos": "position", "vel": "velocity", "rho": "density"}
@@ -127,6 +129,29 @@ holdout = 0
     assert len(weights) > 3 and np.sum(weights**2) == pytest.approx(1)
     np.testing.assert_array_equal(made[0].weights, weights)
     assert made[0].every == 2
+
+
+@pytest.mark.mpi(1)
+def test_a_stopped_comparison_at_left_out_tracks_goes_on(comm, twin, tmp_path, monkeypatch):
+    """Its floor is the error of the measured velocities in the frames that it compares. In the first and the last frame
+    of the tracks, which are not compared, this error is three times as large."""
+    noise, directory = noisy(twin, tmp_path / "noisy.csv"), tmp_path / "run"
+    monkeypatch.setattr(left_out_tracks, "FRAMES", 4)
+    text = SECTION.format(path="noisy.csv", unit=MILLISECONDS) + f"noise = {noise}\n[reconstruction]\n"
+    scene = tracks.with_tracks(scene_of(comm, tmp_path, text + 'fields = ["velocity"]\n'), comm)
+    run(scene, stages=["dns"], output=directory, comm=comm)
+    found = read_measured(scene.tracks)
+    with pytest.raises(Stopped, match="continues after the last frame"):
+        reconstruct.run(scene, comm, directory, StopAtStep(comm, len(found.times) + 2))
+    assert not (directory / "reconstruction.h5").exists()
+    monkeypatch.setattr(reconstruct.ReconstructionRun, "_next", None)  # no frame is left
+    reconstruct.run(scene, comm, directory)
+    with h5py.File(directory / "reconstruction.h5") as file, h5py.File(twin / "ground_truth.h5") as true:
+        assert len(file["fields/reconstructed/time"]) == len(found.times)
+        floor, exact = file["left_out"].attrs["floor"], true["particles/tracers/velocity/value"]
+        errors = [relative(found.frame(frame, complete=True)["velocity"], exact[frame, 20:]) for frame in (2, 3)]
+    # The tracks that end in frame 3, which are not complete, add a quarter; all frames together have twice the error.
+    assert floor == pytest.approx(np.mean(errors), rel=0.35)
 
 
 @pytest.mark.mpi(1)
@@ -570,7 +595,8 @@ def test_a_noise_that_does_not_fit_gives_a_warning(comm, tmp_path, caplog, facto
     position = 0.3 + 0.4 * draw.random((100, 3)) + swing[:, :, None]
     write_tracks(tmp_path / "a.h5", np.repeat(times, 100), np.tile(np.arange(100), rows),
                  (position + noise * draw.standard_normal(position.shape)).reshape(-1, 3), edge=1.0)
-    read_measured(scene_of(comm, tmp_path, f'[tracks]\npath = "a.h5"\nnoise = {factor * noise}\n').tracks)
+    found = read_measured(scene_of(comm, tmp_path, f'[tracks]\npath = "a.h5"\nnoise = {factor * noise}\n').tracks)
+    assert found.about["noise"] == pytest.approx(max(factor, 1) * noise, rel=0.1)  # the one that is used
     assert [words in line for line in caplog.messages if "noise = " in line] == ([True] if words else [])
 
 

@@ -198,7 +198,8 @@ def energy_units(windows: Sequence[TrainingWindow]) -> Tensor:
 class _Recomputed(torch.autograd.Function):
     """function(*columns), a tuple, whose backward pass calls the function again and adds the gradients of parameters.
 
-    `torch.utils.checkpoint` does the same, but loads torch's compiler, which takes two seconds.
+    `torch.utils.checkpoint` is not used, because it loads torch's compiler, which takes two seconds. The first call
+    is without gradients, so a function must not depend on `torch.is_grad_enabled()`.
     """
 
     @staticmethod

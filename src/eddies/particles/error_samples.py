@@ -108,12 +108,13 @@ class ErrorSamples:
         count, square = self._fluctuation(particles, modes, noise)
         (prior, spread), ids = np.sqrt(self.levels * square), as_numpy(particles.id)
         carried = carried_weights(memory.angle / self.every) if memory else ALONE
+        first = frame + MOST_CARRIED - len(carried) // 2  # so that the largest weight is that of the same draw
         errors, self._errors = self._errors, []
         for sample in range(self.count):
             deviation = prior * self._random_modes(frame, sample)
             if errors and memory:
                 deviation = memory.deviation(errors[sample], deviation)
-            random = spread * self._beyond.at(points, ids, frame, sample, carried)
+            random = spread * self._beyond.at(points, ids, first, sample, carried)
             if noise > 0:
                 random += noise * normal(ids, frame, self.count + sample, self.weights)
             if smoothed > 0:

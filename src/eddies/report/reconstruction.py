@@ -52,7 +52,7 @@ def section(about: Mapping[str, float | str], errors: Mapping[str, np.ndarray], 
                  "dissipation rate of the whole flow.")
     shown = Section("reconstruction", "Reconstruction", text, numbers, labels, {
         **{name: "the true field is not known" if name != "validation_error" else "no track was left out"
-           for name in ERRORS}, "left_out_memory": "it needs the viscosity",
+           for name in ERRORS}, "left_out_memory": "it needs the viscosity, and no background",
         "left_out_delaunay": "the tracks span no volume", "left_out_floor": "no noise was estimated"})
     shown.add_figure("reconstruction", "Reconstructed fields", lambda: overview(both, planes),
                      f"Normalised L2 errors over time{''.join(f', {label}' for label in planes)}"

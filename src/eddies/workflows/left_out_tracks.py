@@ -12,6 +12,7 @@ from eddies.io.hdf5 import File
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
+from eddies.parallel.stop import Stopped, StopRequest
 from eddies.particles.particle_field import Form, ParticleField
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.smoothing_kernels import CubicSpline
@@ -25,7 +26,7 @@ log = logging.getLogger("eddies")
 MOST_RADIUS = 0.499 * BOX_LENGTH    # of a kernel: a particle must have one image within it
 FRAMES = 30          # most frames that methods with a memory see, which gains for 20; errors are of the second half
 LEAST_TRACKS = 2     # smallest number of tracks that are left out
-MOST_TRACKS = 1e5    # largest mean number of tracks that are compared: one rank triangulates all of them
+MOST_TRACKS = 1e5    # largest number of tracks of a frame that are compared: one rank triangulates all of them
 IMAGES = 2.5         # thickness of the layer of periodic images around a box for the triangulation, in mean spacings
 
 Rows = dict[str, np.ndarray]
@@ -36,7 +37,7 @@ def kernel_of(tracers: Tracers) -> CubicSpline:
     return CubicSpline(min(tracers.radius_of(NEIGHBORS), MOST_RADIUS))
 
 
-def errors_at_left_out(scene: Scene, source: Source, file: File, comm: Comm) -> dict[str, float]:
+def errors_at_left_out(scene: Scene, source: Source, file: File, stop: StopRequest) -> dict[str, float]:
     """Return the velocity error of each method at the tracks that [reconstruction] holdout leaves out; collective.
 
     Methods are "least-squares", "memory" if the viscosity is known and there is no background, "kriging" among
@@ -44,10 +45,11 @@ def errors_at_left_out(scene: Scene, source: Source, file: File, comm: Comm) -> 
     v_i| / |v'_i| over the left-out tracks that lie in a tetrahedron, and the mean over the second half of the first
     FRAMES frames. `tracks` is their mean number, and `floor` the error of the true velocity, if splines estimate the
     noise of the measured ones. The result is empty for more than MOST_TRACKS tracks, or if fewer than LEAST_TRACKS are
-    left out. `file` is the ground truth.
+    left out. `source` belongs to the method of the scene, and `file` is the ground truth. Raises Stopped on request.
     """
-    settings = scene.reconstruction
+    settings, comm = scene.reconstruction, source.slab.comm
     frames = range(0, len(source.times), settings.every)[:FRAMES]
+    late = frames[len(frames) // 2:]
     forecasts = scene.flow.viscosity > 0 and source.background is None
     methods = ("least-squares", "memory") if forecasts else ("least-squares",)
     if source.most > MOST_TRACKS:
@@ -55,31 +57,36 @@ def errors_at_left_out(scene: Scene, source: Source, file: File, comm: Comm) -> 
         return {}
     found = []
     for method in methods:
-        own = replace(settings, method=method, samples=0)
-        found.append(list(_by_modes(replace(scene, reconstruction=own), Source(scene.tracks, scene.tracers, own, file,
-                                                                               comm), frames)))
+        own = replace(settings, method=method)
+        same = own.resolving(scene.tracers, source.filtered) == settings.resolving(scene.tracers, source.filtered)
+        apart = _by_modes(replace(scene, reconstruction=own),
+                          source if same else Source(scene.tracks, scene.tracers, own, file, comm), frames, late, stop)
+        found.append(list(apart))
+    known = [_gathered(comm, split(source.particles(frame), settings.holdout)[0]) for frame in late]
     alone = comm.Split(comm.rank)
     try:
-        return on_first_rank(comm, lambda: _errors(scene, source, methods, found, alone))
+        return on_first_rank(comm, lambda: _errors(scene, source, late, known, dict(zip(methods, found)), alone))
     finally:
         alone.Free()
 
 
-def _by_modes(scene: Scene, source: Source, frames: range) -> Iterator[tuple[Rows, Rows]]:
-    """Yield for the second half of the frames, on rank 0, the rows of the tracks that are kept and those of the tracks
-    that are left out, with the `estimate` of their velocity; collective."""
+def _by_modes(scene: Scene, source: Source, frames: range, late: range, stop: StopRequest) -> Iterator[Rows]:
+    """Yield for the `late` frames, on rank 0, the rows of the tracks that are left out, with the `estimate` of their
+    velocity; collective."""
     settings, comm = scene.reconstruction, source.slab.comm
     solver, weight, transfer = source.fitted(settings.holdout)
     method = solving_method(settings, solver, scene.flow.viscosity, transfer, weight)
     progress = _progress(settings.method)
     for number, frame in enumerate(frames, 1):
+        if stop():
+            raise Stopped(stop.reason, "continues after the last frame")
         known, apart = split(source.particles(frame), settings.holdout)
         modes = method.of(known, float(source.times[frame]))
         progress(number / len(frames), number)
-        if frame >= frames[len(frames) // 2]:
+        if frame in late:
             with torch.no_grad():
                 estimate = solver.grid.at(modes, solver.grid.points(apart.position))
-            yield _gathered(comm, known), _gathered(comm, apart, estimate=as_numpy(estimate))
+            yield _gathered(comm, apart, estimate=as_numpy(estimate))
 
 
 def _progress(method: str) -> ProgressLine:
@@ -95,19 +102,20 @@ def _gathered(comm: Comm, particles: ParticleSet, **columns: np.ndarray) -> Rows
     return {name: values[order] for name, values in whole.items()}
 
 
-def _errors(scene: Scene, source: Source, methods: tuple[str, ...], found: list[list[tuple[Rows, Rows]]],
+def _errors(scene: Scene, source: Source, frames: range, kept: list[Rows], found: dict[str, list[Rows]],
             alone: Comm) -> dict[str, float]:
-    """Return the errors of all methods. `found` has the results of `_by_modes` for each of `methods`."""
+    """Return the errors of all methods. For each of `frames`, `kept` has the tracks that are kept, and `found`, by
+    method, the results of `_by_modes`."""
     slab = SlabDecomposition(alone, BOX_LENGTH, source.slab.planes)
     form = Form("kriging", kernel_of(scene.tracers), scene.tracers.filter_width)
     rows: list[dict[str, float]] = []
     progress = _progress("neighbours")
-    for number, each in enumerate(zip(*found), 1):
-        known, apart = each[0]
+    for number, (frame, known, *each) in enumerate(zip(frames, kept, *found.values()), 1):
+        apart = each[0]
         if len(apart["id"]) < LEAST_TRACKS:
             continue
         given = {name: torch.from_numpy(known[name]) for name in ("position", "velocity")}
-        estimates = {name: rows_of["estimate"] for name, (_, rows_of) in zip(methods, each)}
+        estimates = {name: rows_of["estimate"] for name, rows_of in zip(found, each)}
         estimates["kriging"] = as_numpy(form.at(ParticleField(slab, form.support, **given),
                                                 torch.from_numpy(apart["position"]))[0])
         estimates["delaunay"] = interpolated(known, apart["position"], source.spacing if source.periodic else 0.0)
@@ -116,11 +124,11 @@ def _errors(scene: Scene, source: Source, methods: tuple[str, ...], found: list[
         exact = apart["velocity"][inside]
         size = np.linalg.norm(exact - exact.mean(0))
         missed = {name: float(np.linalg.norm(values[inside] - exact)) for name, values in estimates.items()}
-        if source.velocity_noise > 0:
-            missed["floor"] = source.velocity_noise * np.sqrt(exact.size)
+        if source.velocity_errors[frame, 0] > 0:
+            missed["floor"] = source.velocity_errors[frame, 0] * np.sqrt(exact.size)
         rows.append({"tracks": float(len(exact)), **{
             name: float(value / size) if size > 0 else np.nan for name, value in missed.items()}})
-        progress(number / len(found[0]), number)
+        progress(number / len(kept), number)
     means = {name: float(np.mean([row[name] for row in rows])) for name in (rows[0] if rows else ())}
     return {name: value for name, value in means.items() if np.isfinite(value)}
 

@@ -240,12 +240,16 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         before = () if saved is None else saved.files
         with FrameSegments(comm, guard.checkpoints.path, whole.layout, before) as segments:
             whole.run(guard, segments)
+            left_out: dict[str, float] = {}
+            if scene.tracks is not None and holdout > 0:
+                guard.save(whole, segments)  # the comparison may take longer than the frames
+                left_out = errors_at_left_out(scene, source, file, guard.stop)
             with create_product(comm, directory / STAGES["reconstruct"].file, "reconstruction",
                                 stage_provenance(scene, "reconstruct")) as product:
                 segments.assemble(product)
                 _describe(product, expected, density is not None)
                 if scene.tracks is not None and holdout > 0:
-                    set_attributes(product.create_group("left_out"), errors_at_left_out(scene, source, file, comm))
+                    set_attributes(product.create_group("left_out"), left_out)
                 tables = {"errors_over_time": whole.errors, "errors_of_fields": whole.of_fields}
                 for name, table in tables.items():
                     if table:

@@ -99,15 +99,16 @@ def best_solver(particles: ParticleSet, make: Callable[[float], ResolvedVelocity
     counts = global_sum(default.grid.decomposition.comm, np.array([len(known.id), len(held_out.id)]))
     if uniform or not counts.all():
         return default, WEIGHT, math.nan
-    errors: dict[float, float] = {}
+    best: tuple[ResolvedVelocity, float, float] | None = None
     for weight in WEIGHTS.tolist():
         solver = make(weight)
         with torch.no_grad():
-            errors[weight] = validation_error(solver, solver.of(known).modes, held_out)
-        if errors[weight] > RISE * min(errors.values()):
+            error = validation_error(solver, solver.of(known).modes, held_out)
+        if best is None or error < best[2]:
+            best = solver, weight, error
+        if error > RISE * best[2]:
             break
-    best = min(errors, key=errors.__getitem__)
-    return make(best), best, errors[best]
+    return best
 
 
 def split(particles: ParticleSet, share: float) -> tuple[ParticleSet, ParticleSet]:

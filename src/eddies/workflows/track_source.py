@@ -80,7 +80,6 @@ class Source:
     background : the mean flow beside which the particles' velocities are; None without one.
     filtered : whether the tracks follow a filtered velocity.
     unit : the scene's unit of length, in the unit of the tracks.
-    velocity_noise : rms error of a velocity component, from the noise of positions; 0 for velocities of the file.
     velocity_errors, error_weights : as in `MeasuredTracks`; errors are zero without measured tracks.
     corner : position of the origin of the tracks' coordinates in the cube, in the unit of the tracks.
     """
@@ -88,7 +87,8 @@ class Source:
     def __init__(self, tracks: Tracks | None, tracers: Tracers, settings: Reconstruction, file: File,
                  comm: Comm) -> None:
         self._tracks, self.truth, self.spacing, self.uniform = None, None, tracers.spacing, False
-        self.velocity_noise, self.error_weights, self.periods = 0.0, np.ones(1), np.ones(3, int)
+        self.error_weights, self.periods = np.ones(1), np.ones(3, int)
+        self._fitted: dict[float, tuple[ResolvedVelocity, float, Tensor]] = {}
         self.background: LinearFlow | None = None
         self.periodic = tracks is None or tracks.volume is None
         self.filtered, width = (tracks or tracers).filtered, tracers.filter_width
@@ -99,7 +99,6 @@ class Source:
             self.unit, self.corner = source.about["length_unit"], source.about["corner"]
             self.periods = source.about["periods"]
             self.velocity_errors, self.error_weights = source.velocity_errors, source.error_weights
-            self.velocity_noise = source.about.get("velocity_noise", 0.0) / self.unit
             tracers = tracers.with_count(count_for(self.spacing))
         resolved = settings.resolving(tracers, self.filtered)
         width = width if self.filtered else NO_FILTER * self.spacing
@@ -125,9 +124,11 @@ class Source:
     def fitted(self, share: float) -> tuple[ResolvedVelocity, float, Tensor]:
         """Return the solver with the best weight of the noise for the surest frame (`best_solver`), this weight, and
         the transfer function of the filter that the particles' velocity has passed; collective."""
-        solver, weight, _ = best_solver(self.particles(self.surest),
-                                        partial(solver_of, self.slab, self.scales, self.periods, self.filtered),
-                                        share, self.uniform)
-        grid = solver.grid
-        transfer = grid.filter_transfer(self.scales["filter_width"]) if self.filtered else torch.ones_like(grid.shell)
-        return solver, weight, transfer
+        if share not in self._fitted:
+            solver, weight, _ = best_solver(self.particles(self.surest),
+                                            partial(solver_of, self.slab, self.scales, self.periods, self.filtered),
+                                            share, self.uniform)
+            grid = solver.grid
+            self._fitted[share] = solver, weight, (grid.filter_transfer(self.scales["filter_width"]) if self.filtered
+                                                   else torch.ones_like(grid.shell))
+        return self._fitted[share]

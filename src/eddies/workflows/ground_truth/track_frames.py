@@ -216,8 +216,9 @@ def _smoothed(found: Tracks, period: float | None, interval: float, settings: Se
                  if noise else "too small to be estimated")
     elif given > 0 and not 1 / FITTING < splines.residual / given < FITTING:
         log.warning("%s", _noise_misfit(settings, splines.residual))
+        noise = float(np.fmax(given, splines.residual))  # the residual of tracks of three rows is NaN
     errors = noise**2 * splines.velocity_errors[order]
-    about |= {"noise": noise, "velocity_noise": float(np.sqrt(errors[:, 0].mean()))}
+    about |= {"noise": noise, "velocity_noise": float(np.sqrt(errors[:, 0].sum() / max(len(errors), 1)))}
     counts = {"tracks are divided at gaps": begins.sum(), "rows are added in gaps": np.sum(rows < 0),
               "tracks of fewer than three rows are left out": len(np.unique(track)) - len(np.unique(splines.track))}
     for what, count in counts.items():
