@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from mpi4py import MPI
 
-from eddies.report.figures import GUIDE, LOOKS, panels, plain_log_ticks, png, styled
+from eddies.report.figures import GUIDE, LOOKS, OUTLINED, panels, plain_log_ticks, png, styled
 from eddies.scene.scene import Scene, load_scene
 from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.measure import is_current, read
@@ -103,11 +103,13 @@ def figure(rows: list[dict]):
     if free is not None:
         axis.axhline(free[1], color=LOOKS["none"][0], linestyle="--", label="no force")
     for name, (cost, error, spread) in points.items():
-        colour, marker = LOOKS.get(name, ("#444444" if name in NAMED else GUIDE, "o"))
+        preset = name.replace("-pairs", " + pairs")
+        colour, marker = LOOKS.get(preset, ("#444444" if name in NAMED else GUIDE, "o"))
         axis.errorbar(cost, error, spread, color=colour, marker=marker, markersize=6 if name in NAMED else 4,
                       linewidth=1, zorder=3 if name in NAMED else 2)
         if name in NAMED:
-            axis.annotate(name, (cost, error), xytext=(6, 6), textcoords="offset points", fontsize=9)
+            axis.annotate(name, (cost, error), xytext=(6, 6), textcoords="offset points", fontsize=9,
+                          path_effects=OUTLINED, zorder=1.5)
     axis.errorbar([], [], [], color=GUIDE, marker="o", markersize=4, linestyle="none", label="other rungs (table)")
     costs = [cost for cost, *_ in points.values()]
     axis.set(xscale="log", xlim=(0.8 * min(costs), 1.7 * max(costs)), xlabel="seconds a turnover, one core",

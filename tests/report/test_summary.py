@@ -43,6 +43,11 @@ def test_what_became_unstable_is_a_cross_at_the_top():
     assert crosses[0].get_ydata() > max(r["velocity_kl"] or 0 for r in ROWS)
 
 
+def test_what_became_unstable_later_is_a_cross_at_its_error():
+    axis = scatter(table_of([*ROWS, row("late", 20.0, 0.4, "stopped: step 9", 0.8)]), ["velocity_error_early"]).axes[0]
+    assert [float(line.get_ydata()[0]) for line in axis.lines if line.get_marker() == "x"] == [0.97, 0.4]
+
+
 def named(*rows):
     return texts(scatter(table_of([ROWS[0], *rows]), ["velocity_error_early"]).axes[0])
 
@@ -55,6 +60,14 @@ def test_the_subject_and_the_most_accurate_of_the_front_are_named():
 def test_few_points_are_all_named_and_points_side_by_side_once():
     assert named(row("slow", 90.0, 0.4), row("none", 1.0, 0.5)) == {"learned", "slow", "none"}
     assert named(row("beside", 20.5, 0.101), row("none", 1.0, 0.5)) == {"learned", "none"}
+
+
+def test_a_name_stands_where_it_covers_no_point():
+    """Two points right of the subject, above and below."""
+    axis = scatter(table_of([row("model", 1.0, 1.0), row("a", 1.3, 1.2), row("b", 1.3, 0.8), row("c", 9.0, 0.1),
+                             row("d", 0.1, 9.0)]), ["velocity_error_early"]).axes[0]
+    name = next(text for text in axis.texts if text.get_text() == "model")
+    assert name.get_ha() == "right" and {text.get_ha() for text in axis.texts} == {"left", "right"}
 
 
 @pytest.mark.parametrize("methods", [1, 9])

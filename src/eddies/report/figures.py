@@ -2,7 +2,7 @@
 
 import functools
 import io
-import itertools
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import PowerNorm, to_hex, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 from matplotlib.transforms import Bbox
 
@@ -43,10 +44,12 @@ STYLE = {
 # kind have one colour.
 LOOKS = {"paper": (MODEL, "o"), "resolved": (SECOND, "s"), "local": (THIRD, "D"), "paper-code": (SIXTH, "v"),
          "wcsph": (FOURTH, "^"), "transport-velocity": (FIFTH, "P"), "none": ("#b5a642", "X"),
-         "resolved + pairs": (SECOND, "X"), "local + pairs": (THIRD, "p"), "transport-velocity-hand": (FIFTH, "<")}
-OTHERS = list(zip(2 * ("#7b3294", "#e7298a", "#66a61e", "#a6761d", "#1b9e77", "#666633"), ">p<d*8d*8>p<"))  # of others
+         "resolved + pairs": (SECOND, "X"), "local + pairs": (THIRD, "p"), "transport-velocity-hand": (FIFTH, "<"),
+         "transport-velocity-rollouts": (FIFTH, ">")}
+OTHERS = list(zip(2 * ("#7b3294", "#e7298a", "#66a61e", "#a6761d", "#ff7f7f", "#666633"), ">p<d*8d*8>p<"))  # of others
 GRID, LIGHTEST = "h", 0.55  # marker of grids; share of white in the blue of the coarsest grid
 WIDE = {"color": TRUTH, "linewidth": 2.2}  # a line of the truth, which is seen beside and behind other lines
+OUTLINED = [withStroke(linewidth=2, foreground="white")]  # of names on points and lines
 ACROSS = 5  # entries in a line of a legend at the foot of a figure
 # The backend is left out: rc_context does not restore it, and a notebook would no longer show its figures.
 PLAIN = {key: value for key, value in matplotlib.rcParamsDefault.items() if key != "backend"}
@@ -161,17 +164,20 @@ def looks(methods: Mapping[str, Sequence[str]], cells: Mapping[str, int]) -> dic
     """Return the colour and the marker of each variant.
 
     methods: for each variant, by its name, the names in LOOKS that suit it; the first one that no earlier variant has
-    is taken. cells: for variants on a grid, the number of cells along its edge; the fewer, the lighter the colour.
+    is taken. Others have a look by their name, if it is free. cells: for variants on a grid, the number of cells along
+    its edge; the fewer, the lighter the colour.
     """
     found: dict[str, Look] = {}
-    free, sizes = iter(itertools.cycle(OTHERS)), sorted(set(cells.values()))
+    sizes = sorted(set(cells.values()))
     for name, suiting in methods.items():
         if name in cells:
             white = LIGHTEST * (1 - sizes.index(cells[name]) / (len(sizes) - 1)) if len(sizes) > 1 else 0.0
             found[name] = to_hex((1 - white) * np.array(to_rgb(BLUE)) + white), GRID
         else:
             known = (LOOKS[key] for key in suiting if key in LOOKS and LOOKS[key] not in found.values())
-            found[name] = next(known, None) or next(free)
+            first = zlib.crc32(name.encode()) % len(OTHERS)
+            free = (look for look in OTHERS[first:] + OTHERS[:first] if look not in found.values())
+            found[name] = next(known, None) or next(free, OTHERS[first])
     return found
 
 

@@ -11,7 +11,8 @@ from matplotlib.lines import Line2D
 
 from eddies.analysis.pareto import COST, cheapest_grid, pareto_front, verdict
 from eddies.measures import DRAWN, MEASURES
-from eddies.report.figures import DNS, GUIDE, Look, legend_at_foot, letter, panels, plain_log_ticks, styled
+from eddies.report.figures import (DNS, GUIDE, OUTLINED, Look, legend_at_foot, letter, panels, plain_log_ticks,
+                                   styled)
 from eddies.report.page import Section
 
 Row = Mapping[str, Any]
@@ -22,10 +23,12 @@ COLUMNS = {"wall_seconds": "seconds a turnover", "training_seconds": "training (
            "velocity_error_end": "at the end", "spectrum_error": "spectrum error",
            "energy_ratio": "energy, model / truth"}
 MOST_NAMED, ROOM = 6, (0.18, 0.06)  # ROOM: width and height of a name, in those of a panel
+LETTER, LINE = 0.018, 0.07  # width of a letter and height of a name with its distance from the point, likewise
+SIDES = (1, 1), (1, -1), (-1, 1), (-1, -1)  # of a point, where its name may stand: right or left, above or below
 CAPTION = ("Wall seconds per turnover T, with the quartiles of the time of a step as bars. Bars of errors are standard "
            "deviations over realisations, if there are several. Dashed line: Pareto front, the variants that no other "
            "one beats in both error and time. Names: the first variant, bold, and the best of the front. Crosses: "
-           "variants that became unstable.")
+           "variants that became unstable, at the upper edge if they have no such error.")
 TEXT = ("Spectrum error and energy are those at the end of the rollout. T is the eddy turnover time at the release of "
         "the tracers. All numbers are in metrics.json.")
 
@@ -154,9 +157,10 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
         down = min(spread, 0.9 * row[measure])  # a bar on a logarithmic axis does not reach 0
         axis.errorbar(row[COST], row[measure], [[down], [spread]], np.maximum(bars, 0), color=colour, marker=marker,
                       elinewidth=1, markersize=9 if chosen else 6, markeredgecolor=DNS if chosen else colour, zorder=4)
-    for row in table.stopped():  # a little below the upper edge
-        axis.plot(row[COST], 0.97, transform=axis.get_xaxis_transform(), color=table.looks[row["name"]][0], marker="x",
-                  markersize=7, markeredgewidth=1.8, zorder=4)
+    for row in table.stopped():  # without an error a little below the upper edge
+        place = {"transform": axis.get_xaxis_transform()} if row[measure] is None else {}
+        axis.plot(row[COST], row[measure] or 0.97, color=table.looks[row["name"]][0], marker="x", markersize=7,
+                  markeredgewidth=1.8, zorder=4, **place)
     front = pareto_front([row[COST] for row in rows], [row[measure] for row in rows])
     axis.plot([rows[index][COST] for index in front], [rows[index][measure] for index in front], color=GUIDE,
               linestyle="--", linewidth=1.2, zorder=1)
@@ -166,24 +170,45 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
             room = max(high / low, 2) ** 0.18  # for names
             limit(low / room, high * room)
         plain_log_ticks(part, subs=(1, 2, 5) if high < 300 * low else (1,))
-    for row in _named(axis, table, rows, measure, front):
-        axis.annotate(row["label"], (row[COST], row[measure]), (6, 6), textcoords="offset points", fontsize=8.5,
-                      annotation_clip=False, zorder=5, fontweight="bold" if row["name"] == table.subject else "normal")
+    places = {row["name"]: _place(axis, row, measure) for row in rows}
+    taken = [*places.values()]
+    for row in _named(table, rows, front, places):
+        right, up = _side(row["label"], place := places[row["name"]], np.array(taken))
+        letters = LETTER * np.arange(1, len(row["label"]) + 1)
+        taken += [place + (right * along, up * LINE / 2) for along in letters]
+        axis.annotate(row["label"], (row[COST], row[measure]), (6 * right, 6 * up), textcoords="offset points",
+                      ha="left" if right > 0 else "right", va="bottom" if up > 0 else "top", fontsize=8.5,
+                      annotation_clip=False, zorder=3, path_effects=OUTLINED,
+                      fontweight="bold" if row["name"] == table.subject else "normal")
 
 
-def _named(axis: Axes, table: ErrorAgainstTime, rows: Sequence[Row], measure: str, front: Sequence[int]) -> list[Row]:
+def _place(axis: Axes, row: Row, measure: str) -> np.ndarray:
+    """Return the place (2,) of a point as a share of the panel."""
+    return axis.transAxes.inverted().transform(axis.transData.transform((row[COST], row[measure])))
+
+
+def _side(label: str, place: np.ndarray, points: np.ndarray) -> tuple[int, int]:
+    """Return the side of a point, right (1) or left (-1) and above (1) or below (-1), where its name covers the fewest
+    of the `points` (n, 2), which are those of the panel and the letters of other names."""
+    def covered(side: tuple[int, int]) -> int:
+        beside = (points - place) * side
+        return int(((beside > 0.005) & (beside < (LETTER * len(label), LINE))).all(1).sum())
+
+    return min(SIDES, key=covered)
+
+
+def _named(table: ErrorAgainstTime, rows: Sequence[Row], front: Sequence[int],
+           places: Mapping[str, np.ndarray]) -> list[Row]:
     """Return at most MOST_NAMED rows whose points get a name: the subject, the most accurate of the front and, if there
-    are few points, the others. A point beside a named one gets none."""
+    are few points, the others. A point beside a named one gets none. `places` are those of the rows' points."""
     wanted = [row for row in rows if row["name"] == table.subject] + [rows[index] for index in front[::-1]]
     if len(rows) <= MOST_NAMED:
         wanted += rows
     named: list[Row] = []
-    places: list[np.ndarray] = []
     for row in wanted:
-        place = axis.transAxes.inverted().transform(axis.transData.transform((row[COST], row[measure])))
-        if len(named) < MOST_NAMED and all((abs(place - other) > ROOM).any() for other in places):
+        others = [places[other["name"]] for other in named]
+        if len(named) < MOST_NAMED and all((abs(places[row["name"]] - other) > ROOM).any() for other in others):
             named.append(row)
-            places.append(place)
     return named
 
 
