@@ -411,7 +411,7 @@ class Reconstruction(Section):
     every: int = integer("interval between reconstructions, in frames", default=1, at_least=1)
     fields: tuple[str, ...] = texts("quantities that are stored; gradient: du_i/dx_j, row by row; strain: its "
                                     "symmetric part, xx, yy, zz, xy, xz, yz; q, r: its invariants",
-                                    *RECONSTRUCTED, default=("velocity", "vorticity", "pressure"))
+                                    *RECONSTRUCTED, default=("velocity", "vorticity"))
     particles: bool = boolean("whether the quantities are stored at the particles too", default=False)
     points: str | None = text("table of points, with columns x, y, z and perhaps time, at which they are stored too",
                               default=None)
