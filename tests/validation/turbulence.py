@@ -29,13 +29,14 @@ from itertools import cycle
 from pathlib import Path
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 from mpi4py import MPI
 
 from eddies.analysis.isotropic_turbulence import Row, StationarySpan, comparison
 from eddies.io.hdf5 import open_product, read_table
 from eddies.report.figures import (
-    BLUE, DNS, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, looks, number_wavenumbers, panels, styled,
+    BLUE, DNS, GUIDE, MODEL, SECOND, THIRD, TRUTH, legend_at_foot, letter, looks, number_wavenumbers, panels, styled,
 )
 from eddies.report.page import shown
 from eddies.report.stationary import draw_compensated
@@ -257,7 +258,8 @@ def draw_grid(found: dict[str, dict[int, np.ndarray]], grids: set[str], shells: 
             axis.loglog(shells, found[name][station].mean(0), **lines[name], label=name)
         axis.set(title=f"$t U_0/M = {station}$", xlabel="$k$", ylabel="$E(k)$")
         number_wavenumbers(axis)
-    axes.flat[0].legend(fontsize=7)
+    with rc_context({"legend.handlelength": 4}):  # a whole pattern of dashes
+        legend_at_foot(figure, axes.flat[0])
     letter(axes.flat)
     return figure
 
