@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import starmap
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -30,7 +31,7 @@ from eddies.particles.devices import prepare_torch
 from eddies.particles.error_samples import ErrorSamples
 from eddies.particles.exchanges import fluctuations, relative_error
 from eddies.particles.particle_field import Form, ParticleField
-from eddies.particles.fourier_grid import FourierGrid
+from eddies.particles.fourier_grid import FourierGrid, Points
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.remembered_velocity import RememberedVelocity
 from eddies.particles.resolved_velocity import ResolvedVelocity, captured_dissipation
@@ -130,8 +131,9 @@ class ReconstructionRun:
         if self.points is not None:
             sets["points"] = self.points.at(self.steps)
         made = Quantities(modes, self.grid, self.settings.fields, self.medium)
-        found = [made.on(self.target), *map(made.at, sets.values())]
-        for spread, values in zip(self._deviations(particles, modes, frame, [*sets.values()]), found):
+        places = [(self.grid.points(each.position), as_numpy(each.position)) for each in sets.values()]
+        found = [made.on(self.target), *starmap(made.at, places)]
+        for spread, values in zip(self._deviations(particles, modes, frame, places), found):
             values |= spread
         on_grid, *at_sets = found
         segments.fields["reconstructed"].append(time, self.target.decomposition.start, on_grid)
@@ -149,13 +151,13 @@ class ReconstructionRun:
         self.errors.append(row)
 
     def _deviations(self, particles: ParticleSet, modes: Tensor, frame: int,
-                    sets: Sequence[ParticleSet]) -> list[dict[str, np.ndarray]]:
-        """Return the standard deviations of the errors on the grid, and then at each of `sets`."""
-        squares: list[dict[str, np.ndarray]] = [{} for _ in range(1 + len(sets))]
+                    places: Sequence[tuple[Points, np.ndarray]]) -> list[dict[str, np.ndarray]]:
+        """Return the standard deviations of the errors on the grid, and then at each of `places`."""
+        squares: list[dict[str, np.ndarray]] = [{} for _ in range(1 + len(places))]
         medium = replace(self.medium, background=None)
         for error in self.samples.of(particles, modes, frame, *self.source.velocity_errors[frame]):
             made = Quantities(error, self.grid, self.settings.deviations, medium)
-            for total, values in zip(squares, [made.on(self.target), *map(made.at, sets)]):
+            for total, values in zip(squares, [made.on(self.target), *starmap(made.at, places)]):
                 for name, value in values.items():
                     total[name] = total.get(name, 0.0) + value**2
         return [{name + DEVIATION: np.sqrt(square / self.samples.count) for name, square in total.items()}
@@ -360,10 +362,9 @@ class Quantities:
             modes.resolve_conj()))), target.coordinates())
 
     @torch.no_grad()
-    def at(self, particles: ParticleSet) -> dict[str, np.ndarray]:
-        """Return the wanted quantities by name, (n, components) at the particles of this rank; collective."""
-        points = self.grid.points(particles.position)
-        found = self._of(lambda modes: as_numpy(self.grid.at(modes, points)).T, as_numpy(particles.position).T)
+    def at(self, points: Points, position: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the wanted quantities by name, (n, components) at the points of this rank; collective."""
+        found = self._of(lambda modes: as_numpy(self.grid.at(modes, points)).T, position.T)
         return {name: values.T for name, values in found.items()}
 
     def _of(self, values: Callable[[Tensor], np.ndarray], place: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
