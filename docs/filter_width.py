@@ -26,7 +26,7 @@ DRAWN = ("velocity_error_half", "acceleration_kl")
 # Label, colour and marker of the variants.
 MARKERS = {"resolved": ("resolved", *LOOKS["resolved"]),
            "grid": ("best grid of its cost, exact start", BLUE, GRID),
-           "grid-particles": ("the same, start from particles", "#7db8dc", GRID),
+           "grid-particles": ("the same, start from particles", BLUE, GRID),
            "paper": ("paper", *LOOKS["paper"]),
            "transport-velocity": ("transport-velocity", *LOOKS["transport-velocity"]),
            "local": ("local", *LOOKS["local"]), "no-force": ("no-force", *LOOKS["none"])}
@@ -71,8 +71,9 @@ def drawn(results: Sequence[Mapping[str, Any]]) -> Figure:
     for axis, measure in zip(axes.flat, DRAWN):
         for name, (words, colour, marker) in MARKERS.items():
             width, error, spread, _ = zip(*points(results, name, measure))
+            hollow = {"linestyle": "--", "markerfacecolor": "white"} if name == "grid-particles" else {}
             axis.errorbar(width, error, [[min(s, 0.9 * e) for s, e in zip(spread, error)], spread], color=colour,
-                          marker=marker, markersize=6, capsize=2, elinewidth=1, label=words)
+                          marker=marker, markersize=6, capsize=2, elinewidth=1, label=words, **hollow)
         if f"{measure}_floor" in MEASURES:
             width, floor, *_ = zip(*points(results, "resolved", f"{measure}_floor"))
             axis.plot(width, floor, color=FILTERED, linestyle=":", label="two samples of the truth")
