@@ -142,7 +142,8 @@ def test_terms_and_weights_that_nothing_trains(warned, tmp_path):
 @pytest.mark.mpi(1)
 def test_the_pressure_of_filtered_tracks_is_not_found_among_neighbours(comm):
     def lines(method, filtered="true"):
-        scene = load_scene(TINY, [f"reconstruction.method={method}", f"tracers.filtered={filtered}"],
+        scene = load_scene(TINY, [f"reconstruction.method={method}", f"tracers.filtered={filtered}",
+                                  'reconstruction.fields=["pressure"]'],
                            ["kernel", "model", "training", "simulation"])
         return [line for line in problems_of(scene, comm)[1] if "the pressure will be useless" in line]
 
