@@ -179,11 +179,10 @@ def main(arguments: list[str]) -> None:
     numbers |= {name: numbers_of(run) for name, run in runs.items()}
     numbers = {name: numbers[name] for name in NAMES if name in numbers}
     NUMBERS.write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
-    for name, run in runs.items():
-        if name == "training":
-            continue
-        keep(f"paper-{name}", run.path)
-        add(f"paper-{name}", drawn(run.path, [*MODELS]))
+    rollouts = {name: drawn(run.path, [*MODELS]) for name, run in runs.items() if name != "training"}
+    for name, found in rollouts.items():
+        keep(f"paper-{name}", runs[name].path)
+        add(f"paper-{name}", found)
     save(HERE / "figure-3.png", figure_3(numbers))
     if "training" in runs:
         shown = runs["training"].figures
@@ -191,12 +190,11 @@ def main(arguments: list[str]) -> None:
         save(HERE / "figure-2.png", shown["figure-2-reconstruction"])
     if not {"mt008", "mt016"} <= {*runs}:
         return
-    rollouts = {name: drawn(runs[name].path, [*MODELS]) for name in ("mt016", "mt008")}
     for number, draw in ((4, velocity_planes), (5, vorticity_and_energy), (6, particle_pdfs), (7, invariant_planes)):
         save(HERE / f"figure-{number}.png", draw(rollouts["mt016"]))
     save(HERE / "figure-8.png", figure_8([(f"$M_t = {mach_number(runs[name]):.2f}$", found,
                                            [runs[name].variant(variant) for variant in MODELS])
-                                          for name, found in rollouts.items()]))
+                                          for name, found in ((name, rollouts[name]) for name in ("mt016", "mt008"))]))
 
 
 if __name__ == "__main__":

@@ -45,8 +45,6 @@ WORDS = MEASURES | {"acceleration_error": "acceleration error", "spectrum_error"
                     "count_variance": "variance of counts", "plane_difference": "error of a plane",
                     "wall_seconds": "seconds a turnover", "core_seconds": "core seconds a turnover",
                     "training_seconds": "training (s)",
-                    "velocity_kl_half": "KL velocity, T/2", "velocity_kl_end": "KL velocity, T",
-                    "acceleration_kl_half": "KL acceleration, T/2", "acceleration_kl_end": "KL acceleration, T",
                     "time_step": "step",
                     "step_integrator": "integrator", "step_size": "step", "step_seconds": "search (s)",
                     "step_error_twice": "error with twice the step", "step_error": "error",

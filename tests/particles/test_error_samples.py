@@ -179,13 +179,12 @@ def test_a_memory_carries_unresolved_scales_along(comm, monkeypatch):
 def test_unresolved_scales_are_carried_along_while_the_angle_changes(comm, monkeypatch):
     """Angles with one more or one fewer weight on each side, and none in the first frame."""
     solver, drawn = solver_on(comm), []
-    memory, angles = RememberedVelocity(solver, 0.0, torch.ones_like(solver.grid.shell), 16.0), (
-        0.0, 0.49, 0.51, 0.49)
+    memory = RememberedVelocity(solver, 0.0, torch.ones_like(solver.grid.shell), 16.0)
     samples, particles = ErrorSamples(solver, 1, memory), velocities_of(solver, flow_of(solver, 0, 1e-2), 0.1)
     samples.levels, solve = np.array([0.0, 1.0]), samples._error
     monkeypatch.setattr(samples, "_error", lambda equations, points, noise, *rest: (
         drawn.append(noise.ravel().numpy()), solve(equations, points, noise, *rest))[1])
-    for frame, angle in enumerate(angles):
+    for frame, angle in enumerate((0.0, 0.49, 0.51, 0.49)):
         modes, memory.angle = memory.of(particles, 0.2 * frame), angle
         list(samples.of(particles, modes, frame))
     found = [np.corrcoef(drawn[frame:frame + 2])[0, 1] for frame in range(3)]

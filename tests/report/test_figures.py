@@ -74,7 +74,7 @@ def test_each_method_has_one_colour_and_one_marker():
     assert found["grid-16"][1] == found["grid-32"][1] and found["grid-32"][0] == "#0072b2"
     assert sum(int(found["grid-16"][0][at:at + 2], 16) for at in (1, 3, 5)) > 0x72 + 0xb2  # lighter
     assert looks({"other": ["other", "paper"]}, {})["other"] == LOOKS["paper"]
-    assert looks({"first": ["first"], "mine": ["mine"]}, {})["mine"] == found["mine"]  # in any company
+    assert looks({"mine": ["mine"]}, {})["mine"] == found["mine"]  # in other company
     many = looks({f"own-{number}": [] for number in range(12)}, {})
     assert len(set(many.values())) == 12 and not {*many.values()} & {*LOOKS.values()}
 
