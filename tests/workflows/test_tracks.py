@@ -10,13 +10,15 @@ import pytest
 
 from eddies import open_run, run, write_tracks
 from eddies.io.errors import ProductError
+from eddies.io.hdf5 import open_product
 from eddies.parallel.slab import SlabDecomposition
-from eddies.parallel.stop import Stopped
+from eddies.parallel.stop import Stopped, StopRequest
 from eddies.particles.error_samples import ErrorSamples
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import export, left_out_tracks, reconstruct, tracks
 from eddies.workflows.diff import numbers_of
 from eddies.workflows.ground_truth.track_frames import read_measured
+from eddies.workflows.track_source import Source
 from tests.commands import first_rank
 from tests.workflows.small_rollout import prepared
 from tests.workflows.stopping import StopAtStep
@@ -152,6 +154,31 @@ def test_a_stopped_comparison_at_left_out_tracks_goes_on(comm, twin, tmp_path, m
         errors = [relative(found.frame(frame, complete=True)["velocity"], exact[frame, 20:]) for frame in (2, 3)]
     # The tracks that end in frame 3, which are not complete, add a quarter; all frames together have twice the error.
     assert floor == pytest.approx(np.mean(errors), rel=0.35)
+
+
+@pytest.mark.mpi(1)
+def test_methods_at_left_out_tracks_have_their_own_modes(comm, twin, tmp_path):
+    """Whichever of them is the method of the scene; for tracks of the whole flow a memory has more modes."""
+    section = SECTION.replace("true", "false").replace("every = 2", "every = 6")
+    section = section.format(path=twin / "tracks.csv", unit=MILLISECONDS)
+    text, found = f"{section}viscosity = {1e-3 * (MILLIMETRES / 6.28)**2}\n[reconstruction]\nevery = 3\n", {}
+    for method in ("least-squares", "memory"):
+        scene = tracks.with_tracks(scene_of(comm, tmp_path, f'{text}method = "{method}"\n'), comm)
+        run(scene, stages=["dns"], output=tmp_path / "run", comm=comm)
+        with open_product(comm, tmp_path / "run/ground_truth.h5", "ground_truth") as file:
+            source = Source(scene.tracks, scene.tracers, scene.reconstruction, file, comm)
+            found[method] = left_out_tracks.errors_at_left_out(scene, source, file, StopRequest(comm))
+    assert found["memory"] == pytest.approx(found["least-squares"], rel=1e-3)
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.filterwarnings("error")
+def test_tracks_of_two_rows_are_refused(comm, tmp_path):
+    position = np.random.default_rng(1).random((60, 3))
+    write_tracks(tmp_path / "a.h5", np.repeat([0.0, 0.1, 0.2, 0.3], 15), np.repeat([0, 100], 30) + np.tile(
+        np.arange(15), 4), position, edge=1.0)
+    with pytest.raises(SceneError, match="have no track with three rows or more"):
+        read_measured(scene_of(comm, tmp_path, '[tracks]\npath = "a.h5"\n').tracks)
 
 
 @pytest.mark.mpi(1)
