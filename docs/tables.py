@@ -44,8 +44,8 @@ NUMBERS = re.compile(r"(<!-- numbers of ([\w-]+)\n(.*?)-->\n).*?(?=<!-- end of n
 WORDS = MEASURES | {"acceleration_error": "acceleration error", "spectrum_error": "spectrum error",
                     "count_variance": "variance of counts", "plane_difference": "error of a plane",
                     "wall_seconds": "seconds a turnover", "core_seconds": "core seconds a turnover",
-                    "training_seconds": "training (s)",
-                    "time_step": "step",
+                    "training_seconds": "training (s)", "time_step": "step", "turnovers": "turnovers",
+                    "forced_energy_ratio": "energy", "forced_spectrum_error": "spectrum error",
                     "step_integrator": "integrator", "step_size": "step", "step_seconds": "search (s)",
                     "step_error_twice": "error with twice the step", "step_error": "error",
                     "step_error_half": "with half"}
@@ -63,8 +63,17 @@ STEP_COLUMNS = ("step_integrator", "step_size", "step_error_twice", "step_error"
 
 
 def keep(name: str, run: Path) -> None:
-    """Write the results of a run that has been reported beside the others."""
+    """Write the results of a run that has been reported beside the others. Rows of forced rollouts get their averages
+    over the second half of the time, relative to the stationary flow, with the standard error as the spread."""
     metrics = json.loads((run / "report/metrics.json").read_text(encoding="utf-8"))
+    for row in metrics.get("rows", ()):
+        if forced := metrics.get("forced", {}).get(row["name"]):
+            energy, spectrum = forced["energy"], forced["spectrum_error"]
+            row |= {"turnovers": metrics["rollouts"][row["name"]]["turnovers"],
+                    "forced_energy_ratio": energy["model"] / energy["stationary flow"],
+                    "forced_energy_ratio_spread": energy["standard error"] / energy["stationary flow"],
+                    "forced_spectrum_error": spectrum["model"],
+                    "forced_spectrum_error_spread": spectrum["standard error"]}
     found = {key: metrics[key] for key in KEPT} if "rows" in metrics else metrics
     (HERE / "results" / f"{name}.json").write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
 

@@ -62,6 +62,22 @@ def test_of_a_comparison_the_rows_are_kept_and_of_another_run_all(tables, tmp_pa
     assert tables.record_of("own") == {key: value for key, value in metrics.items() if key not in left}
 
 
+def test_rows_of_forced_rollouts_are_kept_with_their_averages(tables, tmp_path, monkeypatch):
+    for directory in ("run/report", "results"):
+        (tmp_path / directory).mkdir(parents=True)
+    metrics = dict.fromkeys(tables.KEPT, "a word") | {
+        "rows": [{"name": "one"}, {"name": "two"}], "rollouts": {"one": {"turnovers": 20.0}},
+        "forced": {"one": {"energy": {"model": 1.5, "standard error": 0.03, "stationary flow": 1.25},
+                           "spectrum_error": {"model": 0.1, "standard error": 0.02}}}}
+    (tmp_path / "run/report/metrics.json").write_text(json.dumps(metrics))
+    monkeypatch.setattr(tables, "HERE", tmp_path)
+    tables.keep("own", tmp_path / "run")
+    page = "<!-- table of own: turnovers forced_energy_ratio forced_spectrum_error\n-->\n{}<!-- end of table -->"
+    lines = ("| | turnovers | energy | spectrum error |\n|---|---|---|---|\n"
+             "| `one` | 20 | 1.200 ± 0.024 | 0.10 ± 0.02 |\n| `two` |  |  |  |\n")
+    assert tables.written(page.format("")) == page.format(lines)
+
+
 def test_numbers_of_a_run_are_those_of_its_metrics(tables, tmp_path, monkeypatch):
     (tmp_path / "results").mkdir()
     record = {"rollout": {"energy_ratio": 0.99584, "bands": {"1-2": 1.25}}}

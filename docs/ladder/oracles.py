@@ -5,7 +5,7 @@
 The force of `density-constant`, which has no equation for the density, is evaluated with the true density at the places
 of the particles, or with that of the same particle in the truth. For all trained rungs the error of the acceleration at
 single moments of unseen flows is split into a solenoidal and a compressive part: the second gathers particles. Writes
-../results/ladder-oracles.json.
+../results/ladder-oracles.json, where rungs that are not trained keep what is there.
 """
 
 import argparse
@@ -128,15 +128,18 @@ def two_errors(scene: Scene, directory: Path, truth: GroundTruth) -> dict[str, f
 
 
 def main(ladder: Path, runs: list[Path]) -> None:
-    found: dict[str, dict] = {"errors": {}, "density": {}}
+    found = json.loads(OUTPUT.read_text(encoding="utf-8"))
     tests = [ladder / f"realisation-{seed}" / "ground_truth.h5" for seed in TESTS]
     models = {(run, name): own for run in [ladder, *runs]
               for name, own in load_scene(run / "scene.toml").variant.items() if (run / name / "model.h5").exists()}
+    for run, name in models:
+        found["errors"].setdefault(run.name, {})[name] = []
+    if (ladder, STEADY) in models:
+        found["density"] = {}
     for path in tests:
         with open_truth(MPI.COMM_SELF, path) as truth:
             for (run, name), own in models.items():
-                rows = found["errors"].setdefault(run.name, {}).setdefault(name, [])
-                rows.append(two_errors(own, run / name, truth))
+                found["errors"][run.name][name].append(two_errors(own, run / name, truth))
             if (ladder, STEADY) in models:
                 for case, made in (("own", None), ("at the places", AtPlaces), ("of the particles", OfParticles)):
                     row = rollout(models[ladder, STEADY], ladder / STEADY, truth, made and made(truth))

@@ -268,7 +268,7 @@ def table_of_cores(found: dict) -> str:
 @styled
 def draw(found: dict) -> bytes:
     """Figure: seconds over particles, parts with bounds, and seconds over cores."""
-    figure, (axes,) = panels(1, 3, (4.2, 3.6))
+    figure, (axes,) = panels(1, 3, (3.4, 3.4))
     figure.set_layout_engine("constrained")  # for labels and legends that are wide
     over_particles(axes[0], found)
     parts(axes[1], found)
@@ -310,13 +310,13 @@ def over_particles(axis: Axes, found: dict) -> None:
     cells = np.array([row["cells"] for row in found["grid"]])
     axis.loglog((cells / CELLS_A_PARTICLE) ** 3, [row["seconds_per_step"] / 4 for row in found["grid"]],
                 marker=GRID, color=BLUE, label="grid of 1.5 cells a particle")
-    axis.loglog(64**3, NOTEBOOKS, "*", color="black", markersize=10)
-    axis.annotate("published notebooks", (64**3, NOTEBOOKS), xytext=(-9, -3), textcoords="offset points", ha="right")
-    axis.loglog(64**3, PAPER, "P", color=MODEL, label="the paper, one A100")
+    axis.loglog(64**3, NOTEBOOKS, "*", color="black", markersize=9, linestyle="none", label="published notebooks")
+    axis.loglog(64**3, PAPER, "P", color=MODEL, linestyle="none", label="the paper, one A100")
     axis.set_xticks([side**3 for side in SIDES], [f"{side}³" for side in SIDES])
     axis.minorticks_off()
     axis.set(title="two cores", xlabel="particles", ylabel="seconds an evaluation")
-    axis.legend(loc="upper left", bbox_to_anchor=(0, 0.93))
+    axis.set_ylim(top=1e6)  # the legend stands above the marks
+    axis.legend(loc="upper left", fontsize=8)
 
 
 def parts(axis: Axes, found: dict) -> None:
@@ -336,7 +336,7 @@ def parts(axis: Axes, found: dict) -> None:
             bound = found["bounds"][name] / cores
             axis.hlines(bound, place + shift - width / 2, place + shift + width / 2, color="black", linewidth=2,
                         label="least" if place == 0 and cores == 1 else None)
-    axis.set_xticks(range(5), names, fontsize=8)
+    axis.set_xticks(range(5), names, rotation=30, ha="right", rotation_mode="anchor")
     axis.set(title="64³ particles, with pairs", ylabel="seconds an evaluation")
     axis.legend()
 

@@ -201,7 +201,7 @@ def cases(ladder: Path, chosen: list[str]) -> Iterator[tuple[str, str, str, Call
                 yield axis, case, name, partial(outcome, own, weights, flow)
     base = made("M_t-0.08", f"flow.sound_speed={SPEEDS[0.08]}")
     for name, (own, _) in variants.items():
-        if "pairs" in own.model.reads:
+        if "pairs" in own.model.reads and own.training.horizons is None:
             for number in NEIGHBORS:
                 yield "neighbours", str(number), name, partial(with_neighbors, own, name, number, base)
 
