@@ -4,8 +4,8 @@
 
 Realisation 2 of the ladder serves the choice, all others the test, whose mean and standard deviation stand in the
 tables of the page (`docs/tables.py`). With `--seconds` the seconds of a turnover are measured, all rungs in turn on one
-core, else they are those of the last measurement. Writes ../results/RUN.json, and for the ladder the figure
-../paper/ladder.png: error at T over the cost of a turnover.
+core, else they are those of the last measurement. Writes ../results/RUN.json, where variants without rollouts keep
+their rows, and for the ladder the figure ../paper/ladder.png: error at T over the cost of a turnover.
 """
 
 import argparse
@@ -18,8 +18,10 @@ import numpy as np
 import torch
 from mpi4py import MPI
 
+from eddies.io.hdf5 import open_product
 from eddies.report.figures import GUIDE, LOOKS, OUTLINED, panels, plain_log_ticks, png, styled
 from eddies.scene.scene import Scene, load_scene
+from eddies.scene.sections import Horizons
 from eddies.workflows.ground_truth.truth import open_truth
 from eddies.workflows.measure import is_current, read
 from eddies.workflows.rollout.method import TimeStep, make_method
@@ -48,6 +50,18 @@ def measures_of(directory: Path) -> dict[str, float | None]:
     numbers = found["rollout"] | found["accuracy"]
     row = {name: rounded(numbers.get(name)) for name in STORED}
     return row if numbers["stable"] else row | {"plane_difference": None, "broken": rounded(numbers["turnovers"])}
+
+
+def horizon_errors(model: Path, horizons: Horizons) -> dict[str, float]:
+    """The validation error at the longest horizon before the training through rollouts, as "0", and after each number
+    of frames."""
+    with open_product(MPI.COMM_SELF, model, "model") as file:
+        phase, after, before = (file[f"history/{name}"][:] for name in ("phase", "validation_error", "start_error"))
+    first = int(phase[-1]) - len(horizons.frames) + 1
+    kept = [np.nanmin([before[phase == first + number][0], *after[phase == first + number]])
+            for number in range(len(horizons.frames))]
+    return {str(frames): rounded(error)
+            for frames, error in zip((0, *horizons.frames), (before[phase == first][0], *kept))}
 
 
 def step_of(directory: Path, scene: Scene) -> TimeStep:
@@ -126,12 +140,15 @@ def main(run: Path, timed: bool) -> None:
     for name, runs in rollouts(scene, run).items():
         paths, own = [*runs], scene.variant[name]
         if not all((path / "rollout.h5").exists() and is_current(path) for path in paths):
-            print(f"{name}: left out, its rollouts or their measures are missing")
+            print(f"{name}: as before, its rollouts or their measures are missing")
+            rows += [before[name]] if name in before else []
             continue
         step = step_of(run / name, own)
         row = {"name": name, "step_size": step.size, "step_integrator": step.integrator}
         if (run / name / "model.h5").exists():
             row["training_seconds"] = json.loads((run / name / "stage_seconds.json").read_text()).get("train")
+            if own.training.horizons:
+                row["horizon_errors"] = horizon_errors(run / name / "model.h5", own.training.horizons)
         seconds = (seconds_of(runs[paths[1]], paths[1], step, paths[1] / "ground_truth.h5") if timed else
                    before.get(name, {}).get("wall_seconds", math.nan))
         if math.isfinite(seconds):
