@@ -18,15 +18,15 @@ from pictures import save
 
 from eddies.measures import MEASURES
 from eddies.report.summary import in_symbols, is_stable
-from eddies.report.figures import BLUE, FILTERED, GRID, LOOKS, letter, panels, styled
+from eddies.report.figures import BLUE, FILTERED, GRID, LOOKS, legend_at_foot, letter, panels, styled
 
 HERE = Path(__file__).parent
 COMPARISONS = "small", "hit", "coarse", "256"
 DRAWN = ("velocity_error_half", "acceleration_kl")
 # Label, colour and marker of the variants.
 MARKERS = {"resolved": ("resolved", *LOOKS["resolved"]),
-           "grid": ("best grid of its cost, exact start", BLUE, GRID),
-           "grid-particles": ("the same, start from particles", BLUE, GRID),
+           "grid": ("best grid", BLUE, GRID),
+           "grid-particles": ("best grid, from particles", BLUE, GRID),
            "paper": ("paper", *LOOKS["paper"]),
            "transport-velocity": ("transport-velocity", *LOOKS["transport-velocity"]),
            "local": ("local", *LOOKS["local"]), "no-force": ("no-force", *LOOKS["none"])}
@@ -66,8 +66,7 @@ def points(results: Iterable[Mapping[str, Any]], name: str, measure: str) -> lis
 @styled
 def drawn(results: Sequence[Mapping[str, Any]]) -> Figure:
     """A panel for each measure."""
-    figure, axes = panels(1, len(DRAWN), (5.4, 4.2))
-    figure.set_layout_engine("constrained")  # for labels and legends that are wide
+    figure, axes = panels(1, len(DRAWN), (4.0, 3.4))
     for axis, measure in zip(axes.flat, DRAWN):
         for name, (words, colour, marker) in MARKERS.items():
             width, error, spread, _ = zip(*points(results, name, measure))
@@ -76,14 +75,14 @@ def drawn(results: Sequence[Mapping[str, Any]]) -> Figure:
                           marker=marker, markersize=6, capsize=2, elinewidth=1, label=words, **hollow)
         if f"{measure}_floor" in MEASURES:
             width, floor, *_ = zip(*points(results, "resolved", f"{measure}_floor"))
-            axis.plot(width, floor, color=FILTERED, linestyle=":", label="two samples of the truth")
+            axis.plot(width, floor, color=FILTERED, linestyle=":", label="two true samples")
         axis.set(xscale="log", yscale="log", xlabel=r"width of the filter $d/\eta$",
                  ylabel=in_symbols(MEASURES[measure]))
         ticks = sorted(map(width_of, results))
         axis.set_xticks(ticks, [f"{tick:.1f}" if tick < 10 else str(int(tick)) for tick in ticks])  # as pages name them
         axis.minorticks_off()
     letter(axes.flat)
-    axes.flat[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    legend_at_foot(figure, axes.flat[-1])
     return figure
 
 

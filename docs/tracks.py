@@ -54,7 +54,7 @@ def reconstructed(truth: Path, folder: Path) -> dict[str, np.ndarray]:
 @styled
 def figure(found: dict[str, np.ndarray]):
     """Tracks in a slice, u_x in its middle, and the standard deviation of u_x."""
-    drawn, axes = panels(1, 3, (3.6, 2.7), right=BAR)
+    drawn, axes = panels(1, 3, (2.7, 2.3), right=BAR)
     place, limit = found["coordinates"], float(np.abs(found["velocity"]).max())
     near = np.flatnonzero(np.abs(place[-1, :, 2] - np.pi) < THICK)
     for row in near:
@@ -63,12 +63,13 @@ def figure(found: dict[str, np.ndarray]):
         axes[0, 0].plot(*path.T, color="0.55", linewidth=0.7)
     dots = axes[0, 0].scatter(*place[-1, near, :2].T, c=found["at_tracks"][-1, near], s=9, cmap=SIGNED, vmin=-limit,
                               vmax=limit, zorder=2)
-    planes = {"reconstructed $u_x$": (found["velocity"], (-limit, limit), SIGNED), "standard deviation of its error": (
+    planes = {"reconstructed $u_x$": (found["velocity"], (-limit, limit), SIGNED), "its standard deviation": (
         found["velocity_deviation"], (0, float(found["velocity_deviation"].max())), POSITIVE)}
     images = [dots] + [show_plane(axis, *plane) for axis, plane in zip(axes[0, 1:], planes.values())]
     axes[0, 0].set(xlim=(0, 2 * np.pi), ylim=(0, 2 * np.pi), aspect=1, xticks=axes[0, 1].get_xticks(),
                    yticks=axes[0, 1].get_yticks(), xticklabels=["0", "π", "2π"], yticklabels=["0", "π", "2π"])
-    for axis, image, title in zip(axes[0], images, ("tracks", *planes)):
+    axes[0, 0].set(ylabel="$y$")
+    for axis, image, title in zip(axes[0], images, ("tracks: $u_x$", *planes)):
         axis.set(title=title, xlabel="$x$")
         colour_bar(drawn, image, [axis], "", extend="neither")
     return drawn
