@@ -1,7 +1,12 @@
 """The rungs of the ladder: their terms give what they state, on any number of ranks."""
 
+import importlib.util
+import json
+import shutil
+from contextlib import nullcontext
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -77,3 +82,36 @@ def test_noise_of_the_training_belongs_to_the_particle(comm):
     # Two draws differ by sqrt(2) times what one adds: 0.05 u' / (d / 2 u') in the force alone.
     least = 0.05 * 2 * SCALES.velocity ** 2 / SCALES.filter_width
     assert (first - exact).std() > least / 2 and (second - first).std() > least / 2
+
+
+@pytest.fixture
+def table():
+    """docs/ladder/table.py, imported."""
+    spec = importlib.util.spec_from_file_location("table", LADDER.parent / "table.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_results_of_a_rung_without_rollouts_are_kept(table, tmp_path, monkeypatch, capsys):
+    (tmp_path / "own").mkdir()
+    shutil.copy(LADDER, tmp_path / "own" / "scene.toml")
+    results = {"rows": [{"name": "paper", "velocity_error_end": 0.83}, {"name": "no rung of this scene"}]}
+    (tmp_path / "own.json").write_text(json.dumps(results))
+    monkeypatch.setattr(table, "RESULTS", tmp_path)
+    monkeypatch.syspath_prepend(LADDER.parent)
+    table.main(tmp_path / "own", timed=False)
+    assert json.loads((tmp_path / "own.json").read_text())["rows"] == results["rows"][:1]
+    assert "paper: as before" in capsys.readouterr().out
+
+
+def test_the_learning_curve_of_rollouts_has_the_errors_of_the_weights_that_are_kept(table, monkeypatch):
+    """Two phases at single moments, then 2 and 4 frames: a phase without a smaller error keeps that of its start."""
+    nan = np.nan
+    history = {"phase": np.array([0.0, 1, 2, 2, 2, 3, 3]),
+               "start_error": np.array([1.1, 0.95, 0.9, nan, nan, 0.7, nan]),
+               "validation_error": np.array([0.4, 0.9, nan, 0.7, 0.8, nan, 0.75])}
+    stored = {f"history/{name}": values for name, values in history.items()}
+    monkeypatch.setattr(table, "open_product", lambda *_: nullcontext(stored))
+    horizons = table.Horizons(frames=(2, 4), steps=3)
+    assert table.horizon_errors(Path("model.h5"), horizons) == {"0": 0.9, "2": 0.7, "4": 0.7}
