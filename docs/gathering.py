@@ -1,6 +1,6 @@
 """Draws gathering.png: particles in a slice of the box after a turnover, of the truth and of variants of the ladder.
 
-    .venv/bin/python docs/gathering.py runs/ladder paper=published together=repaired local resolved
+    .venv/bin/python docs/gathering.py runs/ladder paper=published horizons-24=repaired local resolved
 """
 
 import sys
@@ -37,8 +37,8 @@ def figure(run: Path, variants: dict[str, str]):
     drawn, axes = panels(1, len(shown), (2.4, 2.65), sharey=True)
     for axis, (label, (_, length, position, velocity)) in zip(axes[0], shown.items()):
         inside = np.abs(position[:, 2] - length / 2) < THICK * length / 2
-        axis.scatter(*position[inside, :2].T, c=velocity[inside, 0], s=9, cmap=SIGNED, vmin=-2.2, vmax=2.2,
-                     edgecolors="0.4", linewidths=0.2)
+        axis.scatter(*position[inside, :2].T, c=velocity[inside, 0], s=11, cmap=SIGNED, vmin=-2.2, vmax=2.2,
+                     edgecolors="0.25", linewidths=0.45)
         axis.spines[:].set_visible(True)
         axis.set(title=f"{label}: {count_variance(position, length):.1f}", xlim=(0, length), ylim=(0, length), aspect=1,
                  xticks=[], yticks=[])
