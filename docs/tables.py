@@ -51,7 +51,7 @@ WORDS = MEASURES | {"acceleration_error": "acceleration error", "spectrum_error"
                     "step_error_half": "with half"}
 # What is kept of the metrics of a comparison; of other runs all is kept.
 KEPT = "name", "title", "machine", "flow", "simulation_seconds", "rows", "summary"
-HEADS, FLOOR, SIMULATION, UNMEASURED = "heads", "floor", "simulation", "unmeasured"
+HEADS, FLOOR, SIMULATION = "heads", "floor", "simulation"
 # The choices that the paper leaves open: the file has the words, and these columns of results.
 CHOICES = HERE / "ladder" / "choices.csv"
 CHOICE_COLUMNS = "acceleration_error", "velocity_error_half", "velocity_error_end", "count_variance"
@@ -92,7 +92,7 @@ def table(comparison: str, columns: str, rows: str) -> str:
     # Any complete row has the floors, which are the truth's.
     results[FLOOR] = {key.removesuffix("_floor"): value for row in record["rows"] for key, value in row.items()
                       if key.endswith("_floor") and value is not None}
-    results |= {SIMULATION: {"wall_seconds": record.get("simulation_seconds")}, UNMEASURED: {}}
+    results |= {SIMULATION: {"wall_seconds": record.get("simulation_seconds")}}
     heads = f" {asked.pop(0)[1]} " if asked[0][0] == HEADS else " "
     for other in {name.partition("/")[0] for name, _ in asked if "/" in name}:
         results |= {f"{other}/{row['name']}": row for row in record_of(other)["rows"]}

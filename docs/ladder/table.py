@@ -33,7 +33,8 @@ RESULTS, FIGURE = HERE.parent / "results", HERE.parent / "paper" / "ladder.png"
 CHOICE = "realisation-2"
 #: The rungs that the line of the figure connects, and those whose names stand beside their points.
 LINE = "paper", "horizons-24", "local", "resolved"
-NAMED = *LINE, "together", "to-resolved", "no-density"
+NAMED = *LINE, "local-pairs", "together", "to-resolved", "no-density"
+BELOW = "local-pairs", "to-resolved"  # of these the names stand below
 FRAMES = 6  # of the timing
 STORED = ("acceleration_error", "velocity_error_early", "velocity_error_half", "velocity_error_end", "plane_difference",
           "energy_ratio", "spectrum_error", "count_variance")
@@ -122,8 +123,8 @@ def figure(rows: list[dict]):
         axis.errorbar(cost, error, spread, color=colour, marker=marker, markersize=6 if name in NAMED else 4,
                       linewidth=1, zorder=3 if name in NAMED else 2)
         if name in NAMED:
-            axis.annotate(name, (cost, error), xytext=(6, 6), textcoords="offset points", fontsize=9,
-                          path_effects=OUTLINED, zorder=1.5)
+            axis.annotate(name, (cost, error), xytext=(6, -13 if name in BELOW else 6), textcoords="offset points",
+                          fontsize=9, path_effects=OUTLINED, zorder=1.5)
     axis.errorbar([], [], [], color=GUIDE, marker="o", markersize=4, linestyle="none", label="other rungs (table)")
     costs = [cost for cost, *_ in points.values()]
     axis.set(xscale="log", xlim=(0.8 * min(costs), 1.7 * max(costs)), xlabel="seconds a turnover, one core",
