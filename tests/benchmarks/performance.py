@@ -43,7 +43,7 @@ from eddies.workflows.variant_rows import processor
 HERE = Path(__file__).parent
 LAYOUTS, SIDES = ((1, 1), (1, 2), (2, 1)), (16, 24, 32, 48, 64, 96)
 MODELS = "resolved", "resolved + pairs", "paper"  # the second one is projected to more cores
-ALL_LAYOUTS = 64             # particles per side; larger ones run on two ranks only
+ALL_LAYOUTS = 64             # particles per side; more run on two ranks only, and not those of `paper`: six seconds
 CELLS_A_PARTICLE = 1.5
 # Operations of the network 16-16 per pair: multiplications with additions; a tanh counts as eleven.
 PAIR_FLOPS = 2 * (3 * 16 + 16 * 16 + 16 * 2 + 32 * 11)
@@ -71,7 +71,7 @@ def measure() -> dict:
     """All measurements and bounds."""
     found: dict = {"processor": processor(), "cores": os.cpu_count(), "steps": [], "grid": []}
     for side in SIDES:
-        for model in MODELS:
+        for model in MODELS if side <= ALL_LAYOUTS else MODELS[:2]:
             for ranks, threads in LAYOUTS if side <= ALL_LAYOUTS else LAYOUTS[-1:]:
                 found["steps"].append(of_job(ranks, threads, "particle_step.py", side, "--model", model,
                                              "--threads", threads))
