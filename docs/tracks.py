@@ -54,7 +54,7 @@ def reconstructed(truth: Path, folder: Path) -> dict[str, np.ndarray]:
 @styled
 def figure(found: dict[str, np.ndarray]):
     """Tracks in a slice, u_x in its middle, and the standard deviation of u_x."""
-    drawn, axes = panels(1, 3, (2.7, 2.3), right=BAR)
+    drawn, axes = panels(1, 3, (3.3, 3.0), right=BAR)
     place, limit = found["coordinates"], float(np.abs(found["velocity"]).max())
     near = np.flatnonzero(np.abs(place[-1, :, 2] - np.pi) < THICK)
     for row in near:
