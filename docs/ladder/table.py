@@ -123,8 +123,9 @@ def figure(rows: list[dict]):
         axis.errorbar(cost, error, spread, color=colour, marker=marker, markersize=6 if name in NAMED else 4,
                       linewidth=1, zorder=3 if name in NAMED else 2)
         if name in NAMED:
-            axis.annotate(name, (cost, error), xytext=(6, -13 if name in BELOW else 6), textcoords="offset points",
-                          fontsize=9, path_effects=OUTLINED, zorder=1.5)
+            place = {"xytext": (0, -22), "ha": "center"} if name in BELOW else {"xytext": (6, 6)}
+            axis.annotate(name, (cost, error), **place, textcoords="offset points", fontsize=9, path_effects=OUTLINED,
+                          zorder=1.5)
     axis.errorbar([], [], [], color=GUIDE, marker="o", markersize=4, linestyle="none", label="other rungs (table)")
     costs = [cost for cost, *_ in points.values()]
     axis.set(xscale="log", xlim=(0.8 * min(costs), 1.7 * max(costs)), xlabel="seconds a turnover, one core",
