@@ -192,9 +192,9 @@ def main(arguments: list[str]) -> None:
         return
     for number, draw in ((4, velocity_planes), (5, vorticity_and_energy), (6, particle_pdfs), (7, invariant_planes)):
         save(HERE / f"figure-{number}.png", draw(rollouts["mt016"]))
-    save(HERE / "figure-8.png", figure_8([(f"$M_t = {mach_number(runs[name]):.2f}$", found,
+    save(HERE / "figure-8.png", figure_8([(f"$M_t = {mach_number(runs[name]):.2f}$", rollouts[name],
                                            [runs[name].variant(variant) for variant in MODELS])
-                                          for name, found in ((name, rollouts[name]) for name in ("mt016", "mt008"))]))
+                                          for name in ("mt016", "mt008")]))
 
 
 if __name__ == "__main__":

@@ -71,7 +71,8 @@ def keep(name: str, run: Path) -> None:
             energy, spectrum = forced["energy"], forced["spectrum_error"]
             row |= {"turnovers": metrics["rollouts"][row["name"]]["turnovers"],
                     "forced_energy_ratio": energy["model"] / energy["stationary flow"],
-                    "forced_energy_ratio_spread": energy["standard error"] / energy["stationary flow"],
+                    "forced_energy_ratio_spread": energy["standard error"] and (  # None of too short a rollout
+                        energy["standard error"] / energy["stationary flow"]),
                     "forced_spectrum_error": spectrum["model"],
                     "forced_spectrum_error_spread": spectrum["standard error"]}
     found = {key: metrics[key] for key in KEPT} if "rows" in metrics else metrics

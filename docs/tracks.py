@@ -63,12 +63,12 @@ def figure(found: dict[str, np.ndarray]):
         axes[0, 0].plot(*path.T, color="0.55", linewidth=0.7)
     dots = axes[0, 0].scatter(*place[-1, near, :2].T, c=found["at_tracks"][-1, near], s=9, cmap=SIGNED, vmin=-limit,
                               vmax=limit, zorder=2)
-    planes = {"reconstructed $u_x$": (found["velocity"], (-limit, limit), SIGNED), "its standard deviation": (
+    planes = {"reconstructed $u_x$": (found["velocity"], (-limit, limit), SIGNED), "rms of its error": (
         found["velocity_deviation"], (0, float(found["velocity_deviation"].max())), POSITIVE)}
     images = [dots] + [show_plane(axis, *plane) for axis, plane in zip(axes[0, 1:], planes.values())]
     axes[0, 0].set(xlim=(0, 2 * np.pi), ylim=(0, 2 * np.pi), aspect=1, xticks=axes[0, 1].get_xticks(),
-                   yticks=axes[0, 1].get_yticks(), xticklabels=["0", "π", "2π"], yticklabels=["0", "π", "2π"])
-    axes[0, 0].set(ylabel="$y$")
+                   yticks=axes[0, 1].get_yticks(), xticklabels=["0", "π", "2π"], yticklabels=["0", "π", "2π"],
+                   ylabel="$y$")
     for axis, image, title in zip(axes[0], images, ("tracks: $u_x$", *planes)):
         axis.set(title=title, xlabel="$x$")
         colour_bar(drawn, image, [axis], "", extend="neither")

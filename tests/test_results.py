@@ -66,15 +66,18 @@ def test_rows_of_forced_rollouts_are_kept_with_their_averages(tables, tmp_path, 
     for directory in ("run/report", "results"):
         (tmp_path / directory).mkdir(parents=True)
     metrics = dict.fromkeys(tables.KEPT, "a word") | {
-        "rows": [{"name": "one"}, {"name": "two"}], "rollouts": {"one": {"turnovers": 20.0}},
+        "rows": [{"name": "one"}, {"name": "two"}, {"name": "short"}],
+        "rollouts": {"one": {"turnovers": 20.0}, "short": {"turnovers": 1.0}},
         "forced": {"one": {"energy": {"model": 1.5, "standard error": 0.03, "stationary flow": 1.25},
-                           "spectrum_error": {"model": 0.1, "standard error": 0.02}}}}
+                           "spectrum_error": {"model": 0.1, "standard error": 0.02}},
+                   "short": {"energy": {"model": 1.5, "standard error": None, "stationary flow": 1.25},
+                             "spectrum_error": {"model": 0.1, "standard error": None}}}}
     (tmp_path / "run/report/metrics.json").write_text(json.dumps(metrics))
     monkeypatch.setattr(tables, "HERE", tmp_path)
     tables.keep("own", tmp_path / "run")
     page = "<!-- table of own: turnovers forced_energy_ratio forced_spectrum_error\n-->\n{}<!-- end of table -->"
     lines = ("| | turnovers | energy | spectrum error |\n|---|---|---|---|\n"
-             "| `one` | 20 | 1.200 ± 0.024 | 0.10 ± 0.02 |\n| `two` |  |  |  |\n")
+             "| `one` | 20 | 1.200 ± 0.024 | 0.10 ± 0.02 |\n| `two` |  |  |  |\n| `short` | 1 | 1.200 | 0.1 |\n")
     assert tables.written(page.format("")) == page.format(lines)
 
 

@@ -1,6 +1,6 @@
 """Cost of an evaluation of a particle model: measurements and bounds, projection to up to 4096 cores, and figure.
 
-    OMP_NUM_THREADS=1 .venv/bin/python tests/benchmarks/performance.py measure docs/performance.json  # 10 min
+    OMP_NUM_THREADS=1 .venv/bin/python tests/benchmarks/performance.py measure docs/performance.json  # 10 to 30 min
     PYTHONPATH=. .venv/bin/python tests/benchmarks/messages.py docs/performance.json  # 15 min on two cores
     .venv/bin/python tests/benchmarks/performance.py project docs/performance.json
     .venv/bin/python tests/benchmarks/performance.py draw docs/performance.json docs/performance.png
@@ -27,13 +27,14 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from mpi4py import MPI
 from step import best, transform_bounds
 
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import planes_for, resolved_shells
 from eddies.report import figures
-from eddies.report.figures import BLUE, GRID, MODEL, SECOND, THIRD, letter, panels, png, styled
+from eddies.report.figures import BLUE, GRID, MODEL, SECOND, THIRD, letter, panels, styled
 from eddies.scene.scene import BOX_LENGTH, Scene, load_scene
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.estimates import estimate, most_ranks
@@ -41,9 +42,13 @@ from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.variant_rows import processor
 
 HERE = Path(__file__).parent
+sys.path.append(str(HERE.parents[1] / "docs"))
+
+from pictures import save  # noqa: E402
+
 LAYOUTS, SIDES = ((1, 1), (1, 2), (2, 1)), (16, 24, 32, 48, 64, 96)
 MODELS = "resolved", "resolved + pairs", "paper"  # the second one is projected to more cores
-ALL_LAYOUTS = 64             # particles per side; more run on two ranks only, and not those of `paper`: six seconds
+ALL_LAYOUTS = 64             # particles per side; more run on two ranks only, without `paper`, the slowest
 CELLS_A_PARTICLE = 1.5
 # Operations of the network 16-16 per pair: multiplications with additions; a tanh counts as eleven.
 PAIR_FLOPS = 2 * (3 * 16 + 16 * 16 + 16 * 2 + 32 * 11)
@@ -266,7 +271,7 @@ def table_of_cores(found: dict) -> str:
 
 
 @styled
-def draw(found: dict) -> bytes:
+def draw(found: dict) -> Figure:
     """Figure: seconds over particles, parts with bounds, and seconds over cores."""
     figure, (axes,) = panels(1, 3, (3.4, 3.4))
     figure.set_layout_engine("constrained")  # for labels and legends that are wide
@@ -274,7 +279,7 @@ def draw(found: dict) -> bytes:
     parts(axes[1], found)
     over_cores(axes[2], found)
     letter(axes)
-    return png(figure)
+    return figure
 
 
 def measured_models(found: dict) -> list[str]:
@@ -374,7 +379,7 @@ def main() -> None:
         print("deviation:", ", ".join(f"{side}³ {deviation:.0%}" for side, deviation in deviations(found).items()))
     else:
         print(table(found))
-        options.figure.write_bytes(draw(found))
+        save(options.figure, draw(found))
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import itertools
 import json
 import math
 import re
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -30,7 +31,7 @@ from eddies.analysis.errors import fluctuations, velocity_error
 from eddies.flow.tracers import lattice_positions
 from eddies.io.weights import load_weights
 from eddies.parallel.slab import SlabDecomposition
-from eddies.report.figures import panels, png, styled
+from eddies.report.figures import panels, styled
 from eddies.report.summary import in_symbols
 from eddies.scene.model import WEIGHTS
 from eddies.scene.scene import Scene, load_scene
@@ -38,6 +39,10 @@ from eddies.spectral.interpolation import SplineInterpolation
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.ground_truth.truth import GroundTruth, open_truth
 from eddies.workflows.rollout.method import TimeStep, make_method
+
+sys.path.append(str(Path(__file__).parents[2] / "docs"))
+
+from pictures import save  # noqa: E402
 
 HERE, OUTPUT = Path(__file__).parent, Path(__file__).parents[2] / "docs" / "validation"
 RUNS, SCENE = Path("runs/stability"), HERE / "stability.toml"
@@ -267,7 +272,7 @@ def main(ladder: Path, chosen: list[str]) -> None:
             known.write_text(json.dumps(found))  # a stopped script goes on here
             print(f"{axis}: {case}: {name}: {results[name]}", flush=True)
     (OUTPUT / "stability-map.json").write_text(json.dumps(found, indent=1) + "\n")
-    (OUTPUT / "stability-map.png").write_bytes(png(figure(found, chosen)))
+    save(OUTPUT / "stability-map.png", figure(found, chosen))
 
 
 if __name__ == "__main__":
