@@ -42,6 +42,7 @@ PAGES = (HERE.parent / "README.md", *sorted(HERE.glob("*.md")))
 TABLE = re.compile(r"(<!-- table of ([\w.-]+): ([^\n]*)\n(.*?)-->\n).*?(?=<!-- end of table -->)", re.DOTALL)
 NUMBERS = re.compile(r"(<!-- numbers of ([\w-]+)\n(.*?)-->\n).*?(?=<!-- end of numbers -->)", re.DOTALL)
 WORDS = MEASURES | {"acceleration_error": "acceleration error", "spectrum_error": "spectrum error",
+                    "velocity_kl_half": "KL velocity at T/2", "acceleration_kl_half": "KL acceleration at T/2",
                     "count_variance": "variance of counts", "plane_difference": "error of a plane",
                     "wall_seconds": "seconds a turnover", "core_seconds": "core seconds a turnover",
                     "training_seconds": "training (s)", "time_step": "step", "turnovers": "turnovers",
