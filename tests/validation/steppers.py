@@ -20,13 +20,13 @@ dissipation nu <|grad u|^2>. Takes minutes.
 
 import argparse
 import math
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
 from flows import amplification, make_grid, march, measured_growth, turbulence, with_density
 from mpi4py import MPI
-from PIL import Image
 
 from eddies.analysis.errors import normalized_l2
 from eddies.clock import Clock
@@ -40,6 +40,10 @@ from eddies.flow.statistics import energy_spectrum, gradient_moments, incompress
 from eddies.parallel.reduction import global_max
 from eddies.report.figures import BLUE, GUIDE, MODEL, SECOND, THIRD, letter, panels, styled
 from eddies.time_stepping import ETDRK4, STEPPERS
+
+sys.path.append(str(Path(__file__).parents[2] / "docs"))
+
+from pictures import save  # noqa: E402
 
 TURBULENT_STEPS = 60
 HIGHEST = 8.0  # of the advective numbers that are tried
@@ -151,8 +155,7 @@ def draw_stability(results, path):
     axes[1, 0].set(title="with sound", xlabel=r"step $\times\ c k$")
     turbulence_panel(axes[1, 1], results["turbulence"])
     letter(axes.ravel())
-    figure.savefig(path, dpi=100, facecolor="white")
-    Image.open(path).convert("RGB").quantize(64).save(path, optimize=True)
+    save(path, figure)
 
 
 def growth_panel(axis, rows):
@@ -294,7 +297,7 @@ def draw_errors(found, path):
     letter(axes.flat)
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2)
-    figure.savefig(path, dpi=100, facecolor="white", pil_kwargs={"optimize": True})
+    save(path, figure)
 
 
 def errors_of_steps(comm, cells, output):

@@ -25,6 +25,7 @@ ln(E/E_experiment), means and standard deviations over the realisations. Writes 
 """
 
 import argparse
+import sys
 from itertools import cycle
 from pathlib import Path
 
@@ -43,6 +44,10 @@ from eddies.report.stationary import draw_compensated
 from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.stored_run import open_run
 from eddies.workflows.ground_truth.stationary import read_stationary_span
+
+sys.path.append(str(Path(__file__).parents[2] / "docs"))
+
+from pictures import save  # noqa: E402
 
 NOMINAL = (0.04, 0.08, 0.16)  # turbulent Mach numbers of the paper's Table 1
 MEASURED, STEPS = 0.05, 0.1  # how far M_t and the steps per turnover may be off
@@ -280,7 +285,7 @@ def compare_with_grid_turbulence(run: Path, output: Path) -> None:
             cells += [spread_cell(spectrum.sum(1) / truth.sum()), spread_cell(rms)]
         print(f"| `{name}` | {' | '.join(cells)} |")
     grids = {name for name, variant in scene.variant.items() if variant.simulation.form.on_grid}
-    draw_grid(found, grids, shells, filter_width).savefig(output / "grid-turbulence.png", dpi=100, facecolor="white")
+    save(output / "grid-turbulence.png", draw_grid(found, grids, shells, filter_width))
 
 
 def main() -> None:
@@ -300,7 +305,7 @@ def main() -> None:
                                 for name, paths in groups.items()}))
     else:
         runs = [Run(directory) for directory in options.runs]
-        draw(runs).savefig(options.output / "turbulence.png", dpi=100, facecolor="white")
+        save(options.output / "turbulence.png", draw(runs))
         print(table_of_runs(runs))
         if len({run.nominal for run in runs}) > 1:
             for name, value in scaling(runs).items():
