@@ -34,7 +34,7 @@ def test_invariants_of_few_particles_are_drawn(particles):
 
 @pytest.mark.parametrize("frames", [1, 2, 4])
 def test_planes_are_as_large_with_few_frames(frames):
-    """Each variant has a row; the second one ends after its first frame."""
+    """Each variant has a row, and each frame after the start a column; the second variant ends at the start."""
     planes = np.random.default_rng(2).normal(size=(frames, 8, 8))
     whole = {"time": 0.1 * np.arange(frames), "u_x_truth": planes, "u_x_model": planes}
     short = {name: values[:1] for name, values in whole.items()}
@@ -42,7 +42,9 @@ def test_planes_are_as_large_with_few_frames(frames):
     png(figure)
     width = figure.axes[0].get_position().width * figure.get_figwidth()
     assert width == pytest.approx(2.0, abs=0.05)  # inches; the colour bar has room in any case
-    assert [len(axis.images) for axis in figure.axes[:3 * frames]] == [1] * (2 * frames + 1) + [0] * (frames - 1)
+    columns = max(1, frames - 1)
+    assert [len(axis.images) for axis in figure.axes[:3 * columns]] == [1] * 2 * columns + [int(frames == 1)] * columns
+    assert figure.axes[columns - 1].get_title() == f"$t = {0.1 * (frames - 1):.2f}\\,T$"
     assert row_at(short, 0.0) == 0 and row_at(whole, 0.1 * frames) is None
 
 

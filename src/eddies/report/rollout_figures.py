@@ -49,20 +49,27 @@ def row_at(table: Table, time: float) -> int | None:
     return row if abs(times[row] - time) <= SAME * max(times.max(), abs(time), 1e-300) else None
 
 
+def after_start(times: np.ndarray) -> np.ndarray:
+    """The times after the start, where all variants are alike; the start if there are none."""
+    return times[times > 0] if (times > 0).any() else times
+
+
 @styled
 def velocity_planes(variants: Variants) -> Figure:
-    """Draw u_x in planes [y, x], with a row of panels for the truth and for each variant, and a column for each time.
+    """Draw u_x in planes [y, x], with a row of panels for the truth and for each variant, and a column for each time
+    after the start.
 
     The planes of the truth determine the colour scale. Each panel of a variant has its normalised L2 difference from
     the truth. A panel without a frame of the variant is empty.
     """
     truth = variants[0].tables["planes"]
-    high, wide = 1 + len(variants), len(truth["time"])
+    times = after_start(truth["time"])
+    high, wide = 1 + len(variants), len(times)
     figure, axes = panels(high, wide, ((2.3 * wide + 1.46) / wide, (2.1 * high + 1.15) / high), right=BAR, sharex=True,
                           sharey=True)
     limit = largest(*truth["u_x_truth"])
     for row, ((table,), of, line) in zip(axes, of_all(variants, "planes")):
-        for axis, time, true in zip(row, truth["time"], truth["u_x_truth"]):
+        for axis, time, true in zip(row, times, truth["u_x_truth"][-wide:]):
             if (at := row_at(table, time)) is not None:
                 plane = table[f"u_x_{of}"][at]
                 image = show_plane(axis, plane, (-limit, limit), SIGNED, _difference(plane, true, of))
@@ -70,7 +77,7 @@ def velocity_planes(variants: Variants) -> Figure:
                 axis.set_aspect("equal")
                 note(axis, "no frame", (0.5, 0.5), "axes fraction", (0, 0), ha="center")
         row[0].set_ylabel(f"{line['label']}\n$y$")
-    for top, last, time in zip(axes[0], axes[-1], truth["time"]):
+    for top, last, time in zip(axes[0], axes[-1], times):
         top.set_title(f"$t = {time / turnover_of(variants):.2f}\\,T$")
         last.set_xlabel("$x$")
     colour_bar(figure, image, axes.flat, "$u_x$")
@@ -140,8 +147,8 @@ def errors_over_time(variants: Variants) -> Figure:
 
 @styled
 def particle_pdfs(variants: Variants) -> Figure:
-    """Draw the PDFs of velocity and acceleration at several times. All three components count in one PDF."""
-    times = variants[0].tables["velocity_pdfs"]["time"]
+    """Draw the PDFs of velocity and acceleration at times after the start. All three components count in one PDF."""
+    times = after_start(variants[0].tables["velocity_pdfs"]["time"])
     figure, axes = panels(2, len(times), (3.5, 2.7), sharex="row", sharey="row")
     for row, (quantity, edges) in zip(axes, EDGES.items()):
         centres, width = bin_centres(edges), np.diff(edges)
