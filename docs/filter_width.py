@@ -79,7 +79,7 @@ def drawn(results: Sequence[Mapping[str, Any]]) -> Figure:
         axis.set(xscale="log", yscale="log", xlabel=r"width of the filter $d/\eta$",
                  ylabel=in_symbols(MEASURES[measure]))
         ticks = sorted(map(width_of, results))
-        axis.set_xticks(ticks, [f"{tick:.1f}" if tick < 10 else str(int(tick)) for tick in ticks])  # as pages name them
+        axis.set_xticks(ticks, [f"{tick:.2g}" for tick in ticks])
         axis.minorticks_off()
     letter(axes.flat)
     legend_at_foot(figure, axes.flat[-1])
