@@ -7,7 +7,7 @@ from PIL import Image
 
 from eddies.report.figures import png
 
-WIDTH, HEIGHT, LEVELS = 1000, 1100, 48  # pixels at most, and levels of each of the three colours
+WIDTH, HEIGHT, LEVELS = 1000, 1050, 48  # pixels at most, and levels of each of the three colours
 
 
 def save(path: Path, figure) -> None:
