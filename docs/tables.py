@@ -49,7 +49,9 @@ WORDS = MEASURES | {"acceleration_error": "acceleration error", "spectrum_error"
                     "forced_energy_ratio": "energy", "forced_spectrum_error": "spectrum error",
                     "step_integrator": "integrator", "step_size": "step", "step_seconds": "search (s)",
                     "step_error_twice": "error with twice the step", "step_error": "error",
-                    "step_error_half": "with half"}
+                    "step_error_half": "with half",
+                    "energy_98_ratio": "energy at 98", "rms_98": "rms at 98",
+                    "energy_171_ratio": "energy at 171", "rms_171": "rms at 171"}
 # What is kept of the metrics of a comparison; of other runs all is kept.
 KEPT = "name", "title", "machine", "flow", "simulation_seconds", "rows", "summary"
 HEADS, FLOOR, SIMULATION = "heads", "floor", "simulation"

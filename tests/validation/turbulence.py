@@ -1,4 +1,4 @@
-"""Direct simulations beside data of the literature, as Markdown tables. A script.
+"""Flows and rollouts beside data of the literature, as Markdown tables. A script.
 
     python tests/validation/turbulence.py mach runs/hit=0.08 RUN=M_T ... [--output runs/validation]
     python tests/validation/turbulence.py spectra "hit=runs/hit,runs/hit-2" hit-256=runs/paper-256
@@ -19,12 +19,14 @@ reference at t = 2.977 with random phases. Its transfer of energy needs about on
 comparison begins at t = 4. The table has energy, enstrophy, skewness and the exponent n of the decay, E ~ (t - t_0)^-n.
 
 grid: decaying grid turbulence beside the experiment of Comte-Bellot and Corrsin. The flows start from the spectrum
-measured at t U0/M = 42. The truth at 98 and 171 is the measured spectrum, filtered as the particles' velocity is. The
-table has, for each variant, the energy up to k_d over that of the filtered experiment and the rms of
-ln(E/E_experiment), means and standard deviations over the realisations. Writes grid-turbulence.png with the spectra.
+measured at t U0/M = 42. The truth at 98 and 171 is the measured spectrum, filtered as the particles' velocity is. For
+each variant docs/results/cbc.json has the energy up to k_d over that of the filtered experiment and the rms of
+ln(E/E_experiment), means and standard deviations over the realisations; docs/tables.py writes the table. Draws
+grid-turbulence.png with the spectra.
 """
 
 import argparse
+import json
 import sys
 from itertools import cycle
 from pathlib import Path
@@ -45,7 +47,8 @@ from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.stored_run import open_run
 from eddies.workflows.ground_truth.stationary import read_stationary_span
 
-sys.path.append(str(Path(__file__).parents[2] / "docs"))
+DOCS = Path(__file__).parents[2] / "docs"
+sys.path.append(str(DOCS))
 
 from pictures import save  # noqa: E402
 
@@ -243,9 +246,16 @@ def rollout_spectra(directory: Path, variant: str, realisations: tuple[int, ...]
     return np.array([run.spectrum("model", time_of(station)).values[shells.astype(int)] for run in runs])
 
 
-def spread_cell(values: np.ndarray) -> str:
-    """Mean and standard deviation over realisations."""
-    return f"{values.mean():.3f} ± {values.std(ddof=1):.3f}"
+def row_of(name: str, spectra: dict[int, np.ndarray], shells: np.ndarray,
+           filter_width: float) -> dict[str, str | float]:
+    """A row of the table: means and standard deviations over the realisations."""
+    numbers: dict[str, np.ndarray] = {}
+    for station, spectrum in spectra.items():
+        truth = filtered_experiment(station, shells, filter_width)
+        numbers |= {f"energy_{station}_ratio": spectrum.sum(1) / truth.sum(),
+                    f"rms_{station}": np.sqrt(np.mean(np.log(spectrum / truth) ** 2, axis=1))}
+    return {"name": name, **{key: float(each.mean()) for key, each in numbers.items()},
+            **{f"{key}_spread": float(each.std(ddof=1)) for key, each in numbers.items()}}
 
 
 @styled
@@ -270,20 +280,14 @@ def draw_grid(found: dict[str, dict[int, np.ndarray]], grids: set[str], shells: 
 
 
 def compare_with_grid_turbulence(run: Path, output: Path) -> None:
-    """Print the table and draw the spectra of a run of the scene `cbc`."""
+    """Store the rows of a run of the scene `cbc` for the tables of docs, and draw the spectra."""
     scene = open_run(run).scene
     filter_width = scene.tracers.filter_width
     shells = np.arange(1.0, np.pi / filter_width + 0.5)
     found = {name: {station: rollout_spectra(run, name, scene.realisations, station, shells) for station in ENERGY}
              for name in scene.variant}
-    print("| | energy at 98 | rms of logarithms at 98 | energy at 171 | rms at 171 |\n|---|---|---|---|---|")
-    for name, of_stations in found.items():
-        cells = []
-        for station, spectrum in of_stations.items():
-            truth = filtered_experiment(station, shells, filter_width)
-            rms = np.sqrt(np.mean(np.log(spectrum / truth) ** 2, axis=1))
-            cells += [spread_cell(spectrum.sum(1) / truth.sum()), spread_cell(rms)]
-        print(f"| `{name}` | {' | '.join(cells)} |")
+    rows = [row_of(name, spectra, shells, filter_width) for name, spectra in found.items()]
+    (DOCS / "results" / "cbc.json").write_text(json.dumps({"rows": rows}, indent=1) + "\n", encoding="utf-8")
     grids = {name for name, variant in scene.variant.items() if variant.simulation.form.on_grid}
     save(output / "grid-turbulence.png", draw_grid(found, grids, shells, filter_width))
 
