@@ -19,11 +19,13 @@ SEED, THICK = 3, 0.125  # the flow, and the thickness of the slice over the edge
 
 
 def particles(path: Path, kind: str, name: str, time: float | None = None):
-    """Time, edge of the box, positions and velocities of the last frame, or of that nearest to a time."""
+    """Time since the release, edge of the box, positions and velocities of the last frame, or of that nearest to a
+    time."""
     with open_product(MPI.COMM_SELF, path, kind) as file:
         rows = Trajectory(file, name)
-        frame = len(rows.times) - 1 if time is None else int(np.argmin(np.abs(rows.times - time)))
-        return float(rows.times[frame]), rows.length, rows.read(frame, "position"), rows.read(frame, "velocity")
+        times = rows.times + (file["rollout"].attrs["start_time"] if kind == "rollout" else 0.0)
+        frame = len(times) - 1 if time is None else int(np.argmin(np.abs(times - time)))
+        return float(times[frame]), rows.length, rows.read(frame, "position"), rows.read(frame, "velocity")
 
 
 @styled

@@ -20,11 +20,12 @@ from pictures import save
 from tables import keep
 
 from eddies import open_run
-from eddies.analysis.pdfs import bin_edges, bin_probabilities, gaussian, kl_divergence, pdf, standardized
+from eddies.analysis.pdfs import bin_centres, bin_probabilities, gaussian, kl_divergence, pdf, standardized
 from eddies.flow.statistics import energy_spectrum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.report.figures import (DNS, FILTERED, GUIDE, LOOKS, OTHERS, TRUTH, Variant, legend_at_foot, letter,
                                    note, panels, plain_log_ticks, styled)
+from eddies.report.models import EDGES
 from eddies.report.rollout_figures import (OUTER_BINS, invariant_planes, particle_pdfs, turnover_of, velocity_planes,
                                            vorticity_and_energy)
 from eddies.spectral.spectral_grid import SpectralGrid
@@ -35,7 +36,6 @@ HERE = Path(__file__).parent / "paper"
 # Variants in the figures: label, colour and marker.
 MODELS = {"paper-forced": ("paper, forced", OTHERS[0]), "paper": ("paper", LOOKS["paper"]),
           "resolved": ("resolved", LOOKS["resolved"]), "local": ("local", LOOKS["local"])}
-BEFORE = bin_edges(8, 65)  # bins of Fig. 3, in standard deviations
 SHADE = "#e4e4e4"
 # Lines of the PDFs of accelerations in Fig. 3: of the truth, of the published model, and for comparison.
 PDFS = ({"color": TRUTH, "label": "true accelerations"},
@@ -63,8 +63,8 @@ def numbers_of(run: StoredRun) -> dict:
     return {"mach": mach_number(run), "delay": own["delay"].values.tolist(),
             "pressure_gradient": own["pressure_gradient_error"].values.tolist(),
             "models": {name: table["acceleration_error"].values.tolist() for name, table in tables.items()},
-            "pdfs": [pdf(values, BEFORE).tolist() for values in (truth, predicted)],
-            "divergence": kl_divergence(*(bin_probabilities(values, BEFORE) for values in (truth, predicted)))}
+            "pdfs": [pdf(values, EDGES).tolist() for values in (truth, predicted)],
+            "divergence": kl_divergence(*(bin_probabilities(values, EDGES) for values in (truth, predicted)))}
 
 
 @styled
@@ -85,11 +85,10 @@ def figure_3(numbers: dict[str, dict]):
     delay.set(xlabel="time after the training interval", ylabel="acceleration error", ylim=(0, None),
               title="flow of the training")
     machs.set(xlabel="$M_t$", ylim=(0, None), title="unseen flows, mean over time")
-    centres = (BEFORE[1:] + BEFORE[:-1]) / 2
     for axis, (key, each) in zip(shown, numbers.items()):
         for density, line in zip(np.array(each["pdfs"]), PDFS):
-            axis.semilogy(centres, np.where(density > 0, density, np.nan), **line)
-        axis.semilogy(centres, gaussian(centres), **PDFS[-1])
+            axis.semilogy(bin_centres(EDGES), np.where(density > 0, density, np.nan), **line)
+        axis.semilogy(bin_centres(EDGES), gaussian(bin_centres(EDGES)), **PDFS[-1])
         seen = "training flow, later" if key == "training" else "unseen"
         axis.set(title=f"$M_t = {each['mach']:.2f}$, {seen}", xlabel="$a$ / standard deviation", ylim=(1e-5, 2),
                  ylabel="PDF")

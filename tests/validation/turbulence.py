@@ -241,9 +241,17 @@ def time_of(station: int) -> float:
 
 def rollout_spectra(directory: Path, variant: str, realisations: tuple[int, ...], station: int,
                     shells: np.ndarray) -> np.ndarray:
-    """E(k) (realisations, shells) of the rollouts at the frame nearest to a station."""
-    runs = [open_run(directory / variant / f"realisation-{seed}") for seed in realisations]
-    return np.array([run.spectrum("model", time_of(station)).values[shells.astype(int)] for run in runs])
+    """E(k) (realisations, shells) of the rollouts at a station; ln E is linear in time between two frames."""
+    found = []
+    for seed in realisations:
+        path = directory / variant / f"realisation-{seed}"
+        with open_product(MPI.COMM_SELF, path / "rollout.h5", "rollout") as file:
+            time = time_of(station) - file["rollout"].attrs["start_time"]  # stored times count from the start
+        spectra = open_run(path)["rollout/spectra_of_model"]
+        place = np.interp(time, spectra["time"], np.arange(len(spectra["time"])))
+        before, after = (np.log(spectra["energy"][int(place) + later].values[shells.astype(int)]) for later in (0, 1))
+        found.append(np.exp(before + place % 1 * (after - before)))
+    return np.array(found)
 
 
 def row_of(name: str, spectra: dict[int, np.ndarray], shells: np.ndarray,
