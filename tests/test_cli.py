@@ -55,6 +55,8 @@ def test_a_command_that_cannot_work_writes_nothing(comm, tmp_path, capfd, argume
 def test_directory_that_cannot_be_made(comm, tmp_path, capfd):
     first_rank(comm, (tmp_path / "file").write_text, "")
     refused(comm, capfd, ["dns", *ABC, "--output", tmp_path / "file" / "run"], "choose another --output")
+    first_rank(comm, (tmp_path / "loop").symlink_to, "loop")
+    refused(comm, capfd, ["dns", *ABC, "--output", tmp_path / "loop"], "choose another")
 
 
 @pytest.mark.mpi(2)

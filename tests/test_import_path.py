@@ -3,11 +3,8 @@
 import sys
 
 import pytest
-import torch
-from torch.utils.checkpoint import checkpoint
 
-from eddies.errors import UserError
-from eddies.import_path import ImportPathError, load, origins, search_in, short_name, users_code
+from eddies.import_path import ImportPathError, load, origins, search_in, short_name
 
 
 def test_the_class_of_a_path_and_its_origin(own):
@@ -44,14 +41,3 @@ def test_a_folder_is_searched_last_and_once(tmp_path, monkeypatch):
     search_in(tmp_path)
     search_in(tmp_path / ".")
     assert sys.path == [*before, str(tmp_path)]
-
-
-def test_training_through_rollouts_recomputes_a_users_code_and_ends_within_it():
-    """torch ends a recomputation by an exception as soon as it has the last value that the gradient needs."""
-    def own(value):
-        with users_code(own, UserError):
-            return value.exp().sin() + 1.0
-
-    value = torch.tensor([0.5], dtype=torch.float64, requires_grad=True)
-    checkpoint(own, value, use_reentrant=False).backward()
-    assert value.grad.item() == pytest.approx((value.exp() * value.exp().cos()).item(), rel=1e-12)

@@ -28,7 +28,7 @@ CHECKPOINT_SECONDS = 600.0
 
 
 def check(scene: Scene | str | Path, *, comm: Comm | None = None) -> None:
-    """Log estimates for a run of a scene: resolution, memory, largest number of ranks, and time. Writes no file.
+    """Log estimates for a run of a scene: resolution, memory, disk, time step, largest number of ranks. Writes no file.
 
     Raises SceneError if a run would be refused.
     """

@@ -361,9 +361,10 @@ def directory(text: str) -> Path:
     if not text:
         raise OptionError("an empty text is not a directory; give a name, or . for the working directory")
     try:
-        Path(text).exists()
-    except OSError as error:
-        raise OptionError(f"{text[:60]}...: cannot be used as a directory: {error.strerror}; choose another") from None
+        Path(text).resolve().exists()
+    except (OSError, RuntimeError) as error:  # a name that is too long, a symbolic link to itself
+        words = getattr(error, "strerror", None) or "its symbolic links form a loop"
+        raise OptionError(f"{text[:60]}: cannot be used as a directory: {words}; choose another") from None
     return Path(text)
 
 

@@ -22,6 +22,11 @@ RECENT = 1000                # number of latest steps whose median the progress 
 INTERVAL = 5.0               # wall seconds between two progress lines
 
 
+def rounded_up(ratio: float) -> int:
+    """Round up to a whole number, but ignore an excess of the order of round-off."""
+    return math.ceil(ratio - ROUND_OFF)
+
+
 class Clock:
     """Counts steps and simulated time, up to the end of a span or until it is stopped.
 

@@ -64,7 +64,7 @@ def users_code(called: Any, problem: type[UserError], hint: str = "") -> Iterato
 
     The text of the error names `called` and, if known, the file and the line; it ends with `hint`. A UserError or a
     MemoryError passes unchanged. All exceptions pass unchanged if `called` belongs to this package. An exception whose
-    class belongs to this package, or by which torch ends a recomputation, also passes unchanged.
+    class belongs to this package also passes unchanged.
     """
     try:
         yield
@@ -73,7 +73,7 @@ def users_code(called: Any, problem: type[UserError], hint: str = "") -> Iterato
     except (Exception, SystemExit) as error:
         module = getattr(called, "__module__", None) or "builtins"
         kind = type(error).__module__
-        if __package__ in (module.partition(".")[0], kind.partition(".")[0]) or kind == "torch.utils.checkpoint":
+        if __package__ in (module.partition(".")[0], kind.partition(".")[0]):
             raise
         file = getattr(sys.modules.get(module), "__file__", None)
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]

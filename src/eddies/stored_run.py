@@ -110,13 +110,11 @@ class StoredRun:
         path = self.path / "report" / "metrics.json"
         if not path.is_file():
             raise UserError(f"{path}: no such file; run `eddies report {self.path}` first")
-        made = path.stat().st_mtime
-        files = [FILE_OF[name] for name in self.products]
-        newer = [file for file in files if (self.path / file).stat().st_mtime > made]
-        if newer:
+        from eddies.io.provenance import read_metrics
+        from eddies.workflows.run_directory.work import newer_products
+        if newer := [str(product.relative_to(self.path)) for product in newer_products(path)]:
             warnings.warn(f"{path}: is older than {', '.join(newer)}; run `eddies report {self.path}` again",
                           stacklevel=2)
-        from eddies.io.provenance import read_metrics
         return read_metrics(path)
 
     def trajectories(self, ids: Any = None, of: str = "model", unwrapped: bool = False) -> xarray.Dataset:
@@ -132,9 +130,6 @@ class StoredRun:
             raise UserError(f"ids = {shortened(str(np.asarray(ids).tolist()))}: must be integers from 0 to "
                             f"{found.sizes['particle'] - 1}, the particles of the run") from None
         if unwrapped:
-            if "image" not in found:
-                raise UserError(f"{self.path}: its particles have no column image, because a version of eddies before "
-                                "1.0 made them; make them again")
             path = found["position"] + 2 * np.pi * found["image"]
             return found.assign(position=path.assign_attrs(found["position"].attrs))
         return found

@@ -13,6 +13,12 @@ def test_a_gaussian_sample_follows_the_normal_density():
     assert standardized(np.array([1.0, 3.0]), np.array([0.0, 4.0])) == pytest.approx([-0.5, 0.5])
 
 
+def test_a_boost_changes_nothing():
+    """Each component has its own mean."""
+    values, boost = np.random.default_rng(4).normal(size=(1000, 3)), np.array([5.0, 0.0, -1.0])
+    assert np.allclose(standardized(values + boost), standardized(values), atol=1e-14 * 5 * 1000**0.5)
+
+
 def test_outliers_keep_their_mass():
     values, edges = np.array([-50.0, -0.5, 0.5, 0.6, 70.0]), bin_edges(1, 4)
     assert np.sum(pdf(values, edges) * np.diff(edges)) == pytest.approx(1)

@@ -53,6 +53,16 @@ def test_a_forecast_is_the_exact_solution(comm):
 
 
 @pytest.mark.mpi(1)
+def test_the_viscous_decay_of_a_forecast_is_exact_at_any_viscosity(comm):
+    """Explicit steps would be unstable: nu k^2 dt is up to 150."""
+    flow = remembered(comm)
+    flow.viscosity = 20.0
+    start = exact(flow.solver.grid, 0.0, np.zeros(3))
+    expected = np.exp(-flow.viscosity * WAVENUMBER**2 * 0.5) * start
+    assert torch.allclose(flow.forecast(start, 0.5), expected, rtol=1e-10, atol=1e-20)
+
+
+@pytest.mark.mpi(1)
 def test_without_data_the_variance_of_the_prior_stays_that_of_the_flow(comm):
     flow = remembered(comm)
     first = flow.solver.equations.penalty

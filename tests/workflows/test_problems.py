@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from eddies import write_tracks
+from eddies.io.hdf5 import Table, create_product, write_table
+from eddies.io.new_files import set_attributes
 from eddies.scene.integrators import SCHEMES
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 from eddies.scene.terms import FilteredEquations, StepUnits
@@ -128,6 +130,23 @@ def test_steps_that_are_too_long_for_a_forced_rollout_or_for_a_term(comm, warned
     longest = 0.4 * ModelDefinition.of(scene).radius / 2 / (0.8 * scene.flow.sound_speed * 1.03)
     assert float(line.partition("at most ")[2].split()[0]) == pytest.approx(longest, rel=0.1)
     assert warned(*sound, "simulation.step=0.001") == []
+
+
+@pytest.mark.mpi(1)
+def test_the_step_of_another_run_is_one_of_the_same_kind_of_method(comm, tmp_path):
+    def refusals(*overrides):
+        given = ["simulation.step=converged", f"simulation.step_from={tmp_path}", *overrides]
+        return [line for line in problems_of(load_scene(TINY, given), comm)[0] if "step_from" in line]
+
+    grid = "simulation.method=eulerian", "eulerian.cells=16"
+    assert all("no such file; run `eddies find-step" in line for line in refusals()) and refusals()
+    for integrator, fits, other in (("etdrk4", grid, ()), ("rk2", (), grid)):
+        with create_product(comm, tmp_path / "step.h5", "step", {}) as file:
+            set_attributes(file.create_group("found"), {"integrator": integrator})
+            write_table(file, f"trials/{integrator}", Table({"size": np.ones(1)}))
+        assert refusals(*fits) == []
+        (line,) = refusals(*other)
+        assert f"({integrator})" in line and line.endswith("name a run of the same method, or remove step_from")
 
 
 @pytest.mark.mpi(1)

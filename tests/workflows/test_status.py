@@ -67,6 +67,11 @@ def test_settings_and_numbers_that_differ(tmp_path):
     assert ["rollouts.error", "0.2", "0.1", "0.5"] in lines and ["row.energy", "0.2", "0.1", "0.5"] in lines
     assert not any("rollouts.same" in line for line in lines)
     assert diff_lines((one, None), (one, None)) == ["no setting differs", "", "no number differs"]
+    (one / "a").mkdir()
+    (one / "a/rollout.h5").touch()
+    os.utime(one / "a/rollout.h5", ((one / "report/metrics.json").stat().st_mtime + 9,) * 2)
+    assert [line for line in diff_lines((one, None), (other, None)) if "is older than the products" in line] == [
+        f"{one / 'report/metrics.json'}: is older than the products; run `eddies report {one}`"]
 
 
 @pytest.mark.mpi(1)

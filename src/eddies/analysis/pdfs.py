@@ -58,15 +58,18 @@ def sampling_divergence(rows: int, probabilities: Callable[[np.ndarray], np.ndar
 
 
 def standardized(values: np.ndarray, reference: np.ndarray | None = None) -> np.ndarray:
-    """Return (values - mean) / standard deviation, with the mean and the standard deviation of `reference`.
+    """Return (values - mean) / standard deviation, with the mean of each component (last axis) of `reference`, and one
+    standard deviation about these means.
 
-    `reference` is by default `values`. Raises ValueError if all values of `reference` are equal.
+    `reference` is by default `values`. A constant vector that is added to both changes nothing. Raises ValueError if
+    the rows of `reference` are equal.
     """
     reference = values if reference is None else reference
-    deviation = np.std(reference)
+    mean = np.mean(reference, axis=0, dtype=float)
+    deviation = np.std(reference - mean)
     if deviation == 0:
         raise ValueError("constant values have no standardised PDF")
-    return (values - np.mean(reference)) / deviation
+    return (values - mean) / deviation
 
 
 def gaussian(values: np.ndarray) -> np.ndarray:

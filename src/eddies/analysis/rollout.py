@@ -170,7 +170,7 @@ class Rollout:
     def late(self) -> np.ndarray:
         """Frame numbers of the model in the second half of the time before `broken`."""
         frames = self.before_broken("model")
-        return frames[self.model.times[frames] >= self.model.times[frames[-1]] / 2]
+        return frames[second_half(self.model.times[frames], float(self.model.times[frames[-1]]))]
 
     def spectral(self) -> np.ndarray:
         """Return the indices of the common frames at whose times the spectrum of the flow is stored."""

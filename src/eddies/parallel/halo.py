@@ -1,11 +1,11 @@
 """Halos: copies of the particles or grid planes just outside a slab, and the adjoint of copying."""
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 from mpi4py import MPI
 
+from eddies.clock import rounded_up
 from eddies.errors import UserError
 from eddies.parallel.slab import SlabDecomposition
 
@@ -124,7 +124,7 @@ def require_thick_slabs(decomposition: SlabDecomposition, width: float) -> None:
 
 def planes_within(width: float, spacing: float) -> int:
     """Return the number of planes of a grid with this spacing that cover the distance `width`."""
-    return math.ceil(width / spacing - 1e-9)
+    return rounded_up(width / spacing)
 
 
 def most_slabs(planes: int, needed: int) -> int:

@@ -52,6 +52,11 @@ class FourierGrid(ModeOperators):
         self._zeroth = (self.shell == 0).to(dtype)
         self._transfers: dict[float, Tensor] = {}
 
+    @property
+    def highest(self) -> float:
+        """k_c, the wavenumber of the highest modes along an axis."""
+        return self.resolved * 2 * math.pi / self.decomposition.length
+
     def repeating(self, periods: Sequence[int]) -> Tensor:
         """Return whether a mode (kz, ky, kx) has these numbers of periods along x, y and z, or multiples of them."""
         unit = 2 * math.pi / self.decomposition.length

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+from eddies.clock import rounded_up
 from eddies.import_path import is_path, load
 from eddies.pipeline import STAGES
 from eddies.scene.integrators import SCHEMES, Scheme
@@ -511,6 +512,11 @@ class Training(Section):
         return self.steps + (self.horizons.steps * len(self.horizons.frames) if self.horizons else 0)
 
     @property
+    def longest_horizon(self) -> int:
+        """Largest number of frames in [training.horizons]; 0 without it."""
+        return max(self.horizons.frames) if self.horizons else 0
+
+    @property
     def truth_files(self) -> tuple[Path, ...]:
         """The files of `truths`; none without the key."""
         return tuple(product_file(path, "dns") for path in self.truths or ())
@@ -673,4 +679,4 @@ class Eulerian(Section):
         whose Nyquist wavenumber reaches pi / filter width."""
         if self.cells is not None:
             return self.cells
-        return max(math.ceil(BOX_LENGTH / filter_width - 1e-9), 8)
+        return max(rounded_up(BOX_LENGTH / filter_width), 8)

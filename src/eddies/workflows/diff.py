@@ -11,6 +11,7 @@ from eddies.parallel.communicator import Comm
 from eddies.report.page import shown
 from eddies.scene.layers import dotted
 from eddies.scene.scene import load_scene
+from eddies.workflows.run_directory.work import newer_products
 
 METRICS = Path("report") / "metrics.json"
 OF_VARIANTS = "rollouts", "forced", "models", "steps"  # parts of metrics.json that hold a dict for each variant
@@ -39,6 +40,8 @@ def diff_lines(one: Choice, other: Choice) -> list[str]:
     lines = [*table("setting", settings, titles), ""]
     if missing := dict.fromkeys(path for path, _ in both if not (path / METRICS).is_file()):
         return [*lines, f"no numbers to compare; run {' and '.join(f'`eddies report {path}`' for path in missing)}"]
+    lines += [f"{path / METRICS}: is older than the products; run `eddies report {path}`"
+              for path in dict.fromkeys(path for path, _ in both) if newer_products(path / METRICS)]
     metrics = [dict(dotted(numbers_of(*each))) for each in both]
     numbers = [{key: value for key, value in each.items() if isinstance(value, int | float)} for each in metrics]
     return [*lines, *table("number", numbers, titles, ratio=True)]

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from eddies.clock import Clock, ladder_step
+from eddies.clock import Clock, ladder_step, rounded_up
 from eddies.cores import threads
 from eddies.errors import UserError
 from eddies.flow.history import EVERY, FlowHistory
@@ -171,11 +171,6 @@ def expected_scales(flow: Flow, initial: Initial, forcing: Forcing | None) -> di
         return None
     found = {"dissipation_rate": rate, **derived_scales(speed, scale, rate, flow.viscosity, flow.largest_wavenumber)}
     return found if flow.viscosity > 0 else None
-
-
-def rounded_up(ratio: float) -> int:
-    """Round up to a whole number, but ignore an excess of the order of round-off."""
-    return math.ceil(ratio - 1e-9)
 
 
 # ---- memory and disk

@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from eddies.clock import SAME
+from eddies.clock import SAME, rounded_up
 from eddies.errors import UserError
 from eddies.flow.initial_fields import SPEEDS
 from eddies.flow.stability import REMEDIES, limits_of_step
@@ -24,6 +24,8 @@ from eddies.parallel.communicator import Comm, node_ranks
 from eddies.parallel.reduction import global_min
 from eddies.particles.flow_units import ScaleError, allowed_step, planes_for, resolved_shells
 from eddies.pipeline import STAGES
+from eddies.scene.integrators import SCHEMES
+from eddies.scene.rules import quoted
 from eddies.scene.scene import (BOX_LENGTH, Flow, Forcing, Initial, Model, Reconstruction, Scene, SceneError,
                                 Simulation, Time, Tracers, Tracks, Training)
 from eddies.scene.terms import StepUnits
@@ -32,6 +34,7 @@ from eddies.workflows.estimates import (Estimates, Measured, Storage, estimate, 
 from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.ground_truth.scene_flow import given_spectrum, stored_states
 from eddies.workflows.learned.source import ModelDefinition, read_source, seen_by, seen_flows, start_within_training
+from eddies.workflows.run_directory.work import read_found_step
 from eddies.workflows.variants import Step
 
 LARGEST_MACH = 0.3           # turbulent Mach number; the relative density fluctuations are about the square of it
@@ -190,7 +193,7 @@ def _too_many(key: str, value: float | str, step: float, span: float) -> Iterato
 def _too_few_frames(scene: Scene, stages: Sequence[str], turnover_time: float, seen: float) -> Iterator[str]:
     """Yield a problem if there are too few frames even at the longest possible turnover time."""
     tracers = scene.tracers
-    frames = max(math.ceil(LARGEST_TURNOVER_RATIO * tracers.turnovers * turnover_time / tracers.frame_interval), 1) + 1
+    frames = max(rounded_up(LARGEST_TURNOVER_RATIO * tracers.turnovers * turnover_time / tracers.frame_interval), 1) + 1
     if frames <= MOST_STEPS:
         try:
             check_frames(stages, scene, seen, frames)
@@ -236,11 +239,28 @@ def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str
             on_first_rank(comm, partial(read_points, points))
         if weights is not None and weights not in made and on_first_rank(comm, weights.is_file):
             read_source(scene.name, ModelDefinition.of(scene), comm)
+        if "simulate" in stages and (path := scene.simulation.step_file) is not None and path not in made:
+            yield from _unfit_step(scene.simulation, path, comm)
         if scene.device != "cpu" and {"train", "simulate"} & {*stages}:
             from eddies.particles.devices import prepare_torch  # imports torch
             prepare_torch(scene.device, comm)
     except UserError as error:
         yield str(error)
+
+
+def _unfit_step(settings: Simulation, path: Path, comm: Comm) -> Iterator[str]:
+    """Yield a problem if the converged step of another run cannot be read, or is that of another kind of method."""
+    key = f"[simulation] step_from = {quoted(settings.step_from)}"
+    try:
+        integrator = read_found_step(path, comm)[0]["integrator"]
+    except UserError as error:
+        yield f"{key}: {error}"
+        return
+    if (integrator in SCHEMES) == settings.form.on_grid:
+        kinds = "particles", "a coarse grid"
+        of, needed = kinds if settings.form.on_grid else kinds[::-1]
+        yield (f"{key}: has the converged step of {of} ({integrator}), and this rollout is one of {needed}; name a run "
+               "of the same method, or remove step_from")
 
 
 # ---- reasons to doubt a result

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from eddies.clock import ROUND_OFF, Clock, ProgressLine, pace_in_words
+from eddies.clock import ROUND_OFF, Clock, ProgressLine, pace_in_words, rounded_up
 from eddies.io.checkpoint import Checkpoint, Guard
 from eddies.io.frame_segments import FrameLayout, FrameSegments, TrajectoryLayout
 from eddies.io.hdf5 import Table, create_product, write_table
@@ -56,7 +56,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         layout = frame_layout(truth.total, truth.decomposition.length, method.has_density)
         segments = FrameSegments(comm, guard.checkpoints.path, layout, () if saved is None else saved.files)
         turnover = truth.reference["eddy_turnover_time"]
-        count = int(np.ceil(settings.turnovers * turnover / settings.frame_interval - 1e-9))
+        count = rounded_up(settings.turnovers * turnover / settings.frame_interval)
         forcing = forcing_of(settings.injection, scene.forcing, truth)
         with segments:
             course = Course(method, segments, count, settings.frame_interval, guard, saved)

@@ -17,7 +17,7 @@ from eddies.pipeline import FILE_OF, MAKER_OF, STAGES, Stage
 from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.workflows.estimates import in_units
 from eddies.workflows.run_directory.fingerprints import set_files, stage_fingerprint
-from eddies.workflows.run_directory.work import differences, of_other_settings, stage_seconds
+from eddies.workflows.run_directory.work import differences, newer_products, of_other_settings, stage_seconds
 from eddies.workflows.variants import steps
 
 SCENE = "scene.toml"
@@ -107,11 +107,10 @@ def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
                 state = f"lacks the ground truth of {', '.join(lacking)}"
             rows.append((prefix + name, seconds.get(name), state))
     page = directory / STAGES["report"].file
-    products = [step.directory / STAGES[name].file for step in planned for name in step.stages]
     state = "to do"
     if page.is_file():
-        old = any(path.stat().st_mtime > page.stat().st_mtime for path in products if path.is_file())
-        state = f"older than the products; run `eddies report {directory}`" if old else f"complete, {page}"
+        state = (f"older than the products; run `eddies report {directory}`" if newer_products(page) else
+                 f"complete, {page}")
     rows.append(("report", stage_seconds(directory).get("report"), state))
     width = max(len(title) for title, *_ in [*rows, ("train-kernel",)])
     for title, seconds, state in rows:

@@ -1,7 +1,5 @@
 """Forces from the resolved velocity: pressure, viscosity, hidden stress, damping, relaxation and forcing."""
 
-import math
-
 import torch
 from torch import nn
 
@@ -90,9 +88,8 @@ class Damping(Term):
 
     def forward(self, context: Context) -> Rates:
         flow = context.resolved
-        highest = 2 * math.pi / context.decomposition.length * flow.grid.resolved
         rates = rising(flow.grid.shell, flow.grid.resolved, self.rates.double().cpu()).to(flow.grid.dtype)
-        return Rates(force_modes=-highest * flow.smallest_rms * rates * flow.velocity)
+        return Rates(force_modes=-flow.grid.highest * flow.smallest_rms * rates * flow.velocity)
 
 
 class Relaxation(Term):

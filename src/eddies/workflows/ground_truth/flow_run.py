@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from eddies.clock import Clock, ProgressLine
+from eddies.clock import Clock, ProgressLine, rounded_up
 from eddies.flow.stability import CourantLimit, FixedStep, StabilityWatch
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import Fluid
@@ -201,7 +201,7 @@ class TracerRun:
         """Number of frame intervals. There is at least one, because the rates at the release are measured over the
         first one."""
         duration = self.settings.turnovers * self.released["eddy_turnover_time"]
-        return max(int(np.ceil(duration / self.settings.frame_interval - 1e-9)), 1)
+        return max(rounded_up(duration / self.settings.frame_interval), 1)
 
     def follow(self) -> None:
         """Follow the tracers to the end of the last interval."""
@@ -231,7 +231,7 @@ class TracerRun:
     def _longest_step(self) -> float:
         interval = self.settings.frame_interval
         longest = min(self.flow.step_limit.bound(self.flow.state, self.flow.clock), self.flow.max_step)
-        return interval / int(np.ceil(interval / longest - 1e-9))
+        return interval / rounded_up(interval / longest)
 
     @property
     def _done(self) -> float:

@@ -38,7 +38,7 @@ def last_trained_on(settings: Training, frames: int) -> int:
     Raises SceneError if too few frames remain for training.
     """
     last = last_seen(settings.window, frames)
-    longest = max(settings.horizons.frames) if settings.horizons else 0
+    longest = settings.longest_horizon
     held_out = max(math.ceil(HELD_OUT * last), longest, 2)  # rates need a frame on both sides
     if last - held_out - longest < 2:
         raise SceneError(

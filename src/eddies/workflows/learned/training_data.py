@@ -62,7 +62,7 @@ class TrainingData:
         self.definition, self.settings, self.truth, self.count = definition, settings, truth, count
         self.dtype = getattr(torch, settings.precision)
         self.model = model_for(definition, truth, self.dtype, like)
-        self.longest = max(settings.horizons.frames) if settings.horizons else 0
+        self.longest = settings.longest_horizon
         self.last = last_seen(settings.window, len(truth.times))
         self.learned = last_trained_on(settings, len(truth.times))
         self.usable, self.held_out = trained_frames(settings, len(truth.times), truth.field_frames)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from eddies.clock import Clock
+from eddies.clock import Clock, rounded_up
 from eddies.flow.stability import CourantLimit, quadratic_energy
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.initial_fields import balanced_density
@@ -84,7 +84,7 @@ class EulerianRun:
         """
         left = until - self.time
         longest = min(self.step_limit.bound(self.state, self.clock), self.longest_step)
-        step = left / math.ceil(left / longest - 1e-9)
+        step = left / rounded_up(left / longest)
         began = time.perf_counter()
         with np.errstate(over="ignore", invalid="ignore"):  # the test of the energy below reports it
             if self.fluid.closure is not None:

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
+from eddies.clock import rounded_up
 from eddies.import_path import is_path, load, users_code
 from eddies.io.checkpoint import Checkpoint
 from eddies.io.weights import load_weights
@@ -145,7 +146,7 @@ class ParticleRun:
         """
         step, left = min(self.settings.longest_step, self._allowed_step()), until - self.time
         if not self.integrator.scheme.dense:
-            step = left / np.ceil(left / step - 1e-9)
+            step = left / rounded_up(left / step)
         try:
             self._before = self._now() if step > left * (1 + 1e-9) else None
             self.particles = self.integrator.step(self.particles, step)
@@ -167,8 +168,7 @@ class ParticleRun:
             allowed = allowed_by_terms(self._limiting, self.model.flow, scheme, speed)
         if resolution is None or not self.limited:
             return allowed
-        highest = resolution.grid.resolved * 2 * np.pi / self.dynamics.box.length
-        return min(allowed, allowed_step(scheme.angle, highest, resolution.speed))
+        return min(allowed, allowed_step(scheme.angle, resolution.grid.highest, resolution.speed))
 
     def _complaint_of_rates(self, number: int) -> str | None:
         """Return a complaint if a rate at the end of step `number` is not finite. The next frame and the next step use

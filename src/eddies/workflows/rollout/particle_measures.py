@@ -10,7 +10,7 @@ import torch
 from eddies.analysis.rollout import Frames
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.flow_units import ReferenceScales
+from eddies.particles.flow_units import ReferenceScales, planes_for
 from eddies.particles.particle_field import Form, ParticleField
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.resolved_velocity import ResolvedVelocity
@@ -119,7 +119,7 @@ class ParticleSpectra:
 
     @cached_property
     def _resolution(self) -> ResolvedVelocity:
-        cells = max(2 * round(0.875 * self.length / self.scales.spacing), 3)  # as `planes_for`; splines need 3
+        cells = max(planes_for(round((self.length / self.scales.spacing) ** 3)), 3)  # splines need 3
         found = ResolvedVelocity.on_slabs(SlabDecomposition(self.alone, self.length, cells), self.scales,
                                           dtype=torch.float32)
         found.most_iterations = MOST_ITERATIONS

@@ -21,7 +21,7 @@ from eddies.io.errors import ContentError, ProductError
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.provenance import product_fingerprint, product_provenance
 from eddies.parallel.communicator import Comm
-from eddies.pipeline import STAGES, Stage
+from eddies.pipeline import FILE_OF, STAGES, Stage
 from eddies.scene.layers import dotted
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Scene, Simulation
@@ -167,6 +167,13 @@ def _scene_of(directory: Path) -> str | None:
         return (directory / "scene.toml").read_text(encoding="utf-8")
     except (OSError, ValueError):
         return None
+
+
+def newer_products(report: Path) -> list[Path]:
+    """Return the products in a run directory, also those of variants, that are newer than this file of its report."""
+    made = report.stat().st_mtime
+    return [path for name in FILE_OF.values() for path in report.parent.parent.rglob(name)
+            if path.is_file() and path.stat().st_mtime > made]
 
 
 def step_path(settings: Simulation, directory: Path) -> Path | None:
