@@ -132,6 +132,7 @@ def test_an_unstable_model_is_worth_nothing():
     unstable = [{**ROWS[0], "status": "stopped: step 9", "stopped_at": 0.8}, *ROWS[1:]]
     summary = table_of([*unstable, row("grid", 9.0, 0.1, kind="coarse grid")]).summary
     assert len(summary) == 2 and not any("grid" in sentence for sentence in summary)
+    assert table_of([unstable[0], ROWS[3]]).summary == [], "nothing reached its end, so nothing is compared"
 
 
 def test_the_summary_names_the_cheapest_complete_grid_that_is_as_accurate():

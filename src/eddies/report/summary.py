@@ -59,11 +59,11 @@ class ErrorAgainstTime:
         """Sentences on where the subject is worth its cost, and on the cheapest grid that is at least as accurate.
 
         A variant that became unstable counts as one without numbers. There are no sentences if the subject has no
-        rollout to compare.
+        rollout to compare, or if no variant has reached its end.
         """
         numbers = [row if is_stable(row) else {**row, **dict.fromkeys(self.drawn)} for row in self.rows]
         subject = next(row for row in numbers if row["name"] == self.subject)
-        if not is_stable(subject) and subject["stopped_at"] is None:
+        if not self.drawn or not is_stable(subject) and subject["stopped_at"] is None:
             return []
         others = [row for row in numbers if row is not subject]
         sentences = verdict(subject, others, {key: MEASURES[key] for key in self.drawn})
