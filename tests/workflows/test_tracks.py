@@ -516,7 +516,8 @@ particles = true
             made = {key: file[f"fields/reconstructed/{key}"][0].astype(float) for key in ("velocity", "gradient")}
             found = [file["particles/tracks/velocity/value"][0],
                      truth["particles/tracers/velocity/value"][0] * about["length_unit"]]
-        points = 2 * np.pi * about["length_unit"] / 24 * np.arange(24) - about["corner"][:, None]
+        field = open_run(folder).field(of="reconstructed")
+        points = [field[axis].values for axis in "xyz"]  # in the coordinates and the unit of the file
         place = np.stack(np.meshgrid(*points, indexing="ij"), -1).T  # (3, z, y, x)
         inner = (np.abs(place - middle[:, None, None, None]) < 1.2).all(0)
         place = place[:, inner].T

@@ -89,7 +89,9 @@ def open_group(path: Path, name: str) -> xarray.Dataset:
                 in_frames = item.ndim > 1 and axes.startswith("time")
                 arrays[key] = (Frames(item.shape, item.dtype, partial(_stored, path.absolute(), item.name))
                                if in_frames else item[()]), axes, units
-        return as_dataset(arrays, {key: python_value(value) for key, value in file[name].attrs.items()})
+        box = file["about"].attrs if "about" in file else {}  # the unit and the place of the box in those of the tracks
+        return as_dataset(arrays, {key: python_value(value) for key, value in file[name].attrs.items()},
+                          box.get("length_unit", 1.0), box.get("corner", np.zeros(3)))
 
 
 def groups_in(file: h5py.File) -> list[str]:
@@ -106,9 +108,11 @@ def groups_in(file: h5py.File) -> list[str]:
 
 
 def as_dataset(arrays: Mapping[str, tuple[np.ndarray | Frames, str, str]],
-               attributes: Mapping[str, Any]) -> xarray.Dataset:
+               attributes: Mapping[str, Any], unit: float = 1.0,
+               corner: Sequence[float] = (0.0, 0.0, 0.0)) -> xarray.Dataset:
     """Return a Dataset of arrays, each with the names of its axes and its units ("" if unknown). Times, ids,
-    wavenumbers and points are coordinates."""
+    wavenumbers and points are coordinates. `unit` is the edge of the cube over 2 pi, and `corner` (3,) is where the
+    origin of the coordinates is in it."""
     variables, coordinates = {}, {}
     for key, (array, axes, units) in arrays.items():
         names = axes.split()
@@ -125,7 +129,8 @@ def as_dataset(arrays: Mapping[str, tuple[np.ndarray | Frames, str, str]],
             if axis in LABELS:
                 coordinates.setdefault(axis, ([axis], LABELS[axis]))
             elif axis in ("x", "y", "z"):
-                coordinates.setdefault(axis, ([axis], EDGE * np.arange(size) / size, {"units": "L"}))
+                coordinates.setdefault(axis, ([axis], unit * EDGE * np.arange(size) / size - corner["xyz".index(axis)],
+                                              {"units": "L"}))
     return xarray.open_dataset(xarray.Dataset(variables, coordinates, attributes), engine=AsGiven)
 
 

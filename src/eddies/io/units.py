@@ -16,6 +16,10 @@ CONVENTIONS = {
              "1 M/L^3",
     "box": "cube with edges 2 pi L, periodic along x, y and z; 0 <= x, y, z < 2 pi; positions are wrapped into it",
 }
+OF_TRACKS = {
+    "units": "L, T: those of the file with the tracks; without such a file those of the ground truth",
+    "box": "cube with edges 2 pi length_unit; the origin of coordinates is at `corner` in it (attributes of about)",
+}
 ORIGINS = {
     "ground_truth": "for particles, filtered and unfiltered fields and `spectra`: the release of the tracers, which is "
                     "at time released_at (attribute of reference) of the simulation; for `statistics`, `stationary` "
@@ -34,7 +38,8 @@ def unit_of(name: str) -> str:
 def conventions(kind: str) -> dict[str, str]:
     """Return attributes that state the units, the box and the origin of time of a product; empty for a product without
     a flow."""
-    return {**CONVENTIONS, "time_origin": ORIGINS[kind]} if kind in ORIGINS else {}
+    stated = OF_TRACKS if kind == "reconstruction" else CONVENTIONS
+    return {**stated, "time_origin": ORIGINS[kind]} if kind in ORIGINS else {}
 
 
 def component_axis(name: str, count: int, of_vectors: str) -> str:
