@@ -85,6 +85,8 @@ def test_variants_of_one_run_are_compared(comm, tmp_path, capfd):
     assert ["simulation.step", "0.08", "0.05"] in [line.split() for line in capfd.readouterr().out.splitlines()]
     assert main(["diff", str(tmp_path)]) == 2
     assert "give two runs" in capfd.readouterr().err
+    assert main(["diff", str(tmp_path), str(tmp_path / "nowhere")]) == 2
+    assert f"{tmp_path / 'nowhere'}: is not a run" in capfd.readouterr().err
     assert main(["status", str(tmp_path)]) == 0
     lines = [line.split() for line in capfd.readouterr().out.splitlines()]
     assert ["b:", "simulate", "to", "do"] in lines and ["dns", "to", "do"] in lines and len(lines) == 7

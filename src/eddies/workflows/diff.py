@@ -5,6 +5,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from eddies.errors import UserError
 from eddies.io.hdf5 import in_files
 from eddies.io.provenance import read_metrics
 from eddies.parallel.communicator import Comm
@@ -31,6 +32,9 @@ def diff_lines(one: Choice, other: Choice) -> list[str]:
     """Return the lines of two tables of differences: of the settings, defaults included, and of the numbers. The second
     table also has the ratio second / first."""
     both = one, other
+    for path, _ in both:
+        if not (path / "scene.toml").is_file():
+            raise UserError(f"{path}: is not a run, because it has no scene.toml; give the directories of two runs")
     titles = tuple(str(path if variant is None else path / variant) for path, variant in both)
     scenes = [load_scene(path / "scene.toml") for path, _ in both]
     for scene, (_, variant) in zip(scenes, both):
