@@ -42,7 +42,7 @@ def run(scene: Scene | str | Path, *, stages: Sequence[str] | None = None, outpu
 
     Parameters
     ----------
-    stages : names such as "dns" and "train-kernel"; run in the order of the pipeline. None: all stages of the scene.
+    stages : names such as "dns" and "train-kernel"; run in the order of the pipeline. None or empty: all of the scene.
     output : the run directory; None: runs/NAME, where NAME is the name of the scene.
     overwrite : if True, products and checkpoints that were made with other settings are replaced; if False, they are an
         error. Complete products of the same settings are always kept.
