@@ -103,6 +103,9 @@ def test_a_step_is_confirmed_on_all_realisations_of_the_same_flow(folder):
              for step in steps(scene, scene.stages_of_all, scene.directory)}
     assert named["runs/steps/own"] == ("runs/steps/realisation-5", "runs/steps/realisation-6")
     assert named["runs/steps/other"] is None and named["runs/steps/own/realisation-5"] is None
+    given = load_scene("steps.toml", ["model.path=eddies:tiny"])  # the search needs the weights, too
+    stages = {where: stages for where, stages, _ in planned(given, given.stages_of_all)}
+    assert stages["runs/steps/own"] == ("train", "find-step")
 
 
 @pytest.mark.mpi(1)

@@ -141,7 +141,9 @@ def _planned(scene: Scene, directory: Path,
             # The time step must converge on all realisations, unless they have another flow than the variant.
             confirmed_on = tuple(str(path / below) for path in realisations)
             own = replace(own, simulation=replace(own.simulation, confirmed_on=confirmed_on))
-        trained = ("train",) if not seeds or own.model is not None and own.model.path is None else ()
+        # With realisations and given weights only the search for the step needs them here.
+        here = not seeds or own.model is not None and (own.model.path is None or own.simulation.finds_step)
+        trained = ("train",) if here else ()
         planned.append((name, own, directory / (name or ""), (*SHARED, *trained, "find-step")))
     for together in zip(*(runs[name or scene.name].items() for name in chosen)):
         planned += [(name, own, where, (*SHARED, *(("train",) if seeds else ()), "simulate"))
