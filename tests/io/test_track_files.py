@@ -98,11 +98,26 @@ def test_a_trajectory_of_lagrangebench(tmp_path):
         for name in ("00000", "00001"):
             file[f"{name}/position"] = position
     found = read_tracks(tmp_path / "train.h5", group="00001")
-    np.testing.assert_array_equal(found.position.reshape(4, 9, 3), position + 1)
+    np.testing.assert_array_equal(found.position.reshape(4, 9, 3), position)
     np.testing.assert_array_equal(found.times, 0.5 * np.arange(4))
-    assert found.edge == 2
+    assert found.edge == 2 and found.lower.tolist() == [-1, -1, -1]
     with pytest.raises(ProductError, match="group = None.*00000, 00001"):
         read_tracks(tmp_path / "train.h5")
+
+
+@pytest.mark.parametrize("about, types, words", [
+    ({"periodic_boundary_conditions": [True, False, True]}, [0, 0], "periodic_boundary_conditions has false"),
+    ({"periodic_boundary_conditions": [True] * 3}, [0, 3], "particle_type has the types 0, 3, .* give the tracks of"),
+    ({"bounds": [[1, 1]] * 3}, [0, 0], "box has the edge 0, which must be a positive"),
+    ({"bounds": [[1, 0]] * 3}, [0, 0], "edge -1, which"), ({"bounds": [[0, np.nan]] * 3}, [0, 0], "edge nan, which")],
+    ids=["walls", "types", "empty", "negative", "NaN"])
+def test_lagrangebench_without_a_periodic_fluid_is_refused(tmp_path, about, types, words):
+    (tmp_path / "metadata.json").write_text(json.dumps({"dt": 0.1, "bounds": [[0, 1]] * 3} | about))
+    with h5py.File(tmp_path / "test.h5", "w") as file:
+        file["00000/position"], file["00000/particle_type"] = np.zeros((4, 2, 3)), types
+    with pytest.raises(ProductError, match=words) as caught:
+        read_tracks(tmp_path / "test.h5")
+    assert str(tmp_path / "test.h5") in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("table", [True, False])
@@ -179,7 +194,9 @@ def test_only_a_periodic_box_of_h5md_has_an_edge(tmp_path, boundary, edge):
     (np.eye(3) + np.eye(3, k=-1) / 2, False, "/particles/all/box/edges: the box is triclinic"),
     (np.tile(np.eye(3) + np.eye(3, k=1) / 9, (4, 1, 1)), True, "/particles/all/box/edges/value: the box is triclinic"),
     (np.linspace(1, 1.01, 4)[:, None] * np.ones(3), True, "box/edges/value: the box changes in time, first in frame 1"),
-    (np.array([1, 1, 2, 1])[:, None, None] * np.eye(3), True, "the box changes in time, first in frame 2")])
+    (np.array([1, 1, 2, 1])[:, None, None] * np.eye(3), True, "the box changes in time, first in frame 2"),
+    (np.zeros(3), False, "edge 0, which must be a positive number"), (np.full(3, -2.0), False, "edge -2, which"),
+    (np.full(3, np.inf), False, "edge inf, which")])
 def test_a_box_of_h5md_that_is_no_constant_cuboid_is_refused(tmp_path, edges, each_frame, words):
     path = with_box(tmp_path / "md.h5", edges, each_frame)
     with pytest.raises(ProductError, match=words) as caught:

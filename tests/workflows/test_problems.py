@@ -173,7 +173,7 @@ def test_the_pressure_of_filtered_tracks_is_not_found_among_neighbours(comm):
 def test_the_pressure_and_the_acceleration_depend_on_what_lies_beyond_a_volume(comm, tmp_path):
     draw = np.random.default_rng(1)
     position = np.tile(draw.uniform(0.1, 0.9, (30, 3)), (3, 1)) + np.repeat([0, 0.01, 0.02], 30)[:, None]
-    write_tracks(tmp_path / "a.h5", np.repeat([0, 1, 2], 30), np.tile(np.arange(30), 3), position)
+    write_tracks(tmp_path / "a.h5", np.repeat([0, 1, 2], 30), np.tile(np.arange(30), 3), position, edge=1.0)
 
     def lines(fields, place="volume = [0, 1, 0, 1, 0, 1]"):
         path = scene_file(tmp_path, f'[tracks]\npath = "a.h5"\nviscosity = 1e-3\n{place}\n[reconstruction]\n'

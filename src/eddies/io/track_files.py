@@ -53,7 +53,7 @@ class Tracks:
     ----------
     time, track : time and track id of each row, (rows,).
     position, velocity, density : (rows, 3), (rows, 3) and (rows,). The last two are None if they were not measured.
-    edge : edge of the periodic cube; None if the file gives none.
+    edge : edge of the periodic cube; None if the file gives none. lower : its lower corner (3,); None for the origin.
     """
 
     time: np.ndarray
@@ -62,6 +62,7 @@ class Tracks:
     velocity: np.ndarray | None = None
     density: np.ndarray | None = None
     edge: float | None = None
+    lower: np.ndarray | None = None
 
     @property
     def columns(self) -> dict[str, np.ndarray]:
@@ -263,10 +264,17 @@ def _read_npz(path: Path, group: str | None, frame_rate: float | None) -> Tracks
 def _read_lagrangebench(path: Path, group: str | None, frame_rate: float | None) -> Tracks:
     metadata = json.loads((path.parent / METADATA).read_text(encoding="utf-8"))
     with h5py.File(path) as file:
-        position = _chosen(path, file, group, "trajectories")["position"][()]
+        holder = _chosen(path, file, group, "trajectories")
+        position, types = holder["position"][()], np.unique(holder.get("particle_type", ()))
+    if len(types) > 1:
+        raise ValueError(f"particle_type has the types {', '.join(map(str, types))}, such as fluid and walls; give the "
+                         "tracks of the fluid as a table")
+    if not np.all(metadata.get("periodic_boundary_conditions", True)):
+        raise ValueError(f"{METADATA}: periodic_boundary_conditions has false, but the box is read as a periodic cube; "
+                         "give the tracks as a table, with volume")
     lower, upper = np.transpose(metadata["bounds"])
     times = float(metadata["dt"]) * int(metadata.get("write_every", 1)) * np.arange(len(position))
-    return _from_frames(times, position - lower, edges=np.unique(upper - lower))
+    return replace(_from_frames(times, position, edges=np.unique(upper - lower)), lower=lower)
 
 
 def _read_flowtracks(path: Path, group: str | None, frame_rate: float | None) -> Tracks:
@@ -321,6 +329,8 @@ def _from_frames(times: np.ndarray, position: np.ndarray, velocity: np.ndarray |
         raise ValueError(f"positions have the shape {position.shape}, not (frames, particles, 3)")
     ids = np.broadcast_to(np.arange(position.shape[1]) if ids is None else ids, position.shape[:2])
     edge = float(edges[0]) if len(edges) == 1 else None
+    if edge is not None and not 0 < edge < math.inf:
+        raise ValueError(f"its box has the edge {edge:g}, which must be a positive number; correct the box")
     for name, values, shape in (("times", times, position.shape[:1]), ("velocities", velocity, position.shape),
                                 ("densities", density, position.shape[:2])):
         if values is not None and np.shape(values) != shape:

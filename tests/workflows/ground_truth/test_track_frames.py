@@ -1,7 +1,9 @@
 """Frames of measured tracks: times, gaps, short tracks, noise, and the place in the periodic cube."""
 
+import json
 import logging
 
+import h5py
 import numpy as np
 import pytest
 
@@ -153,6 +155,27 @@ def test_positions_that_leave_the_box_are_wrapped(tmp_path, shift):
     written(tmp_path / "a.h5", (time, track, 1.3 * (position % 1), velocity))  # wrapped into another box
     with pytest.raises(ProductError, match="outside the box"):
         read_measured(Tracks(path=str(tmp_path / "a.h5"), noise=0))
+
+
+def test_the_box_of_the_file_is_kept(tmp_path):
+    rows = waves(np.arange(10))
+    written(tmp_path / "a.h5", (rows[0], rows[1], (rows[2] + 5 * rows[0][:, None]) % 1, rows[3]))
+    path = str(tmp_path / "a.h5")
+    assert read_measured(Tracks(path=path, box=1 + 1e-9)).about["corner"].tolist() == [0, 0, 0]
+    with pytest.raises(SceneError, match="box = 1.01: .*a.h5 has a periodic box of the edge 1; remove box"):
+        read_measured(Tracks(path=path, box=1.01))
+    with pytest.raises(SceneError, match="volume: tracks of .*a.h5 jump from face to face .*; remove volume"):
+        read_measured(Tracks(path=path, volume="auto"))
+
+
+def test_the_origin_of_lagrangebench_is_kept(tmp_path):
+    position = waves(np.arange(10))[2].reshape(10, COUNT, 3) - 3
+    (tmp_path / "metadata.json").write_text(json.dumps({"dt": STEP, "bounds": [[-3, -2]] * 3}))
+    with h5py.File(tmp_path / "test.h5", "w") as file:
+        file["00000/position"] = position
+    found = read_measured(Tracks(path=str(tmp_path / "test.h5"), noise=0))
+    np.testing.assert_allclose(found.about["corner"], 3)
+    np.testing.assert_allclose(found.frame(9)["position"] * found.about["length_unit"] - 3, position[9], atol=1e-9)
 
 
 def test_a_series_of_files_beside_the_scene(tmp_path):

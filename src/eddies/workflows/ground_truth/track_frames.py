@@ -15,6 +15,7 @@ from eddies.clock import SAME
 from eddies.io.file_patterns import FileVersion, file_versions
 from eddies.io.hdf5 import in_files
 from eddies.io.track_files import OFF, Tracks, check_inside, check_velocities, checked, read_tracks
+from eddies.io.trajectories import ROUNDING
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import block_starts
 from eddies.scene.scene import BOX_LENGTH, SceneError
@@ -165,7 +166,7 @@ def _read_measured(settings: Settings, versions: tuple[FileVersion, ...]) -> Mea
         raise SceneError(f"{settings.file}: {len(times) - len(found.times)} of {len(times)} frames have no track "
                          "with three rows or more, which a velocity needs; give the velocities, or longer tracks")
     _, place, counts = np.unique(found.track, return_inverse=True, return_counts=True)
-    unit, corner = edge / BOX_LENGTH, np.zeros(3) if period else (edge - (upper - lower)) / 2 - lower
+    unit, corner = edge / BOX_LENGTH, (edge - (upper - lower)) / 2 - lower
     columns = {"id": found.track, "position": (found.position + corner) / unit % BOX_LENGTH,
                "velocity": found.velocity / unit}
     if settings.sound_speed is not None:
@@ -327,7 +328,15 @@ def _region(found: Tracks, settings: Settings) -> tuple[np.ndarray, np.ndarray, 
         if edge is None:
             raise SceneError("[tracks] box: this key is missing, and the file has no periodic cubic box; give "
                              'the edge of the periodic cube, or the volume of the measurement, such as volume = "auto"')
-        return np.zeros(3), np.full(3, edge), edge, np.ones(3, int)
+        if found.edge is not None and abs(edge - found.edge) > ROUNDING * edge:
+            raise SceneError(f"[tracks] box = {edge:g}: {settings.file} has a periodic box of the edge {found.edge:g}; "
+                             "remove box, or correct the file")
+        lower = np.zeros(3) if found.lower is None else found.lower
+        return lower, lower + edge, edge, np.ones(3, int)
+    if found.edge is not None and (np.ptp(found.position, axis=0) <= found.edge * (1 + ROUNDING)).all() and not (
+            _continuous(found, found.edge, 0.0)):
+        raise SceneError(f"[tracks] volume: tracks of {settings.file} jump from face to face of its periodic box; "
+                         "remove volume")
     if settings.volume == "auto":
         lower, upper = found.position.min(0), found.position.max(0)
         log.info("%s: volume = [%s]", settings.file, ", ".join(f"{x:.6g}" for x in np.ravel([lower, upper], "F")))
