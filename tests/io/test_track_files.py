@@ -297,3 +297,16 @@ def test_particles_at_rest_contradict_velocities_only_beyond_the_rounding_of_pos
         check_velocities(checked(Tracks(time, track, rest, velocity), "f"), EDGE, "f")
     with pytest.raises(ProductError, match="particles move by 0.[0-9]* between frames .* velocities say 0;"):
         check_velocities(checked(Tracks(time, track, position, 0 * velocity), "f"), EDGE, "f")
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.4])
+def test_velocities_with_wrong_components_contradict_displacements(noise):
+    """With a noise of 0.4 displacements of rms 1 have errors of rms 1 (0.4 sqrt 6), and directions are still known."""
+    draw = np.random.default_rng(1)
+    time, track = (part.ravel() for part in np.meshgrid(np.arange(5.0), np.arange(3000), indexing="ij"))
+    velocity = draw.standard_normal((3000, 3))[track] / np.sqrt(3)
+    position = 5 + velocity * time[:, None] + noise * draw.standard_normal(velocity.shape)
+    check_velocities(checked(Tracks(time, track, position, velocity), "f"), None, "f")
+    for wrong in (-velocity, velocity * [1, -1, 1], velocity[:, ::-1], velocity[:, [1, 2, 0]]):
+        with pytest.raises(ProductError, match="particles move by .* differ from .* correct their order, signs"):
+            check_velocities(checked(Tracks(time, track, position, wrong), "f"), None, "f")

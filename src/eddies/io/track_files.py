@@ -43,6 +43,10 @@ FILL = -1  # the id of a row without a particle
 MOST_ID = 2**53  # larger ids are not exact in double precision
 OFF = 5.0  # largest error of a coordinate, in standard deviations
 MOST_OFF = 2.0  # if displacement and velocity * interval differ by a larger factor, their units are wrong
+# If their difference is larger than this fraction of the displacement, components are wrong. The median is 0.88 if two
+# components of isotropic velocities are swapped or one has the wrong sign; noise of positions makes it 0.8 if it
+# changes displacements by 1.3 times their size.
+MOST_ASIDE = 0.8
 
 
 @dataclass(frozen=True)
@@ -394,9 +398,12 @@ def check_inside(tracks: Tracks, lower: np.ndarray, upper: np.ndarray, key: str,
 
 
 def check_velocities(tracks: Tracks, edge: float | None, path: str | Path) -> None:
-    """Raise ProductError if the median displacements between frames, by positions and by velocities, contradict each
-    other: they differ by the factor MOST_OFF or more, and the larger one exceeds the rounding of positions. A unit or
-    the box is then wrong. `edge` is the edge of the periodic cube, or None."""
+    """Raise ProductError if the displacements between frames, by positions and by velocities, contradict each other.
+
+    Their medians differ by the factor MOST_OFF or more, so a unit or the box is wrong; or the median of their
+    difference exceeds the fraction MOST_ASIDE, so components are wrong. Those within the rounding of positions do not
+    count. `edge` is the edge of the periodic cube, or None.
+    """
     order = np.lexsort((tracks.time, tracks.track))
     same = tracks.track[order[1:]] == tracks.track[order[:-1]]
     first, second = order[:-1][same], order[1:][same]  # successive rows of a track
@@ -406,10 +413,15 @@ def check_velocities(tracks: Tracks, edge: float | None, path: str | Path) -> No
     if edge is not None:
         moved -= edge * np.rint(moved / edge)
     interval = tracks.time[second] - tracks.time[first]
-    measured = float(np.median(np.linalg.norm(moved, axis=1)))
-    given = float(np.median(np.linalg.norm(tracks.velocity[first], axis=1) * interval))
-    least = ROUNDING * (float(np.ptp(tracks.position)) if edge is None else edge)
-    if max(measured, given) > least and not given / MOST_OFF < measured < given * MOST_OFF:
+    said = (tracks.velocity[first] + tracks.velocity[second]) / 2 * interval[:, None]
+    measured, given, aside = (float(np.median(np.linalg.norm(each, axis=1))) for each in (moved, said, moved - said))
+    if max(measured, given) <= ROUNDING * (float(np.ptp(tracks.position)) if edge is None else edge):
+        return
+    if not given / MOST_OFF < measured < given * MOST_OFF:
         raise ProductError(f"{path}: particles move by {measured:.3g} between frames (median), but their velocities "
                            f"say {given:.3g}; correct time_unit, the box, or the unit of the velocities, or leave the "
                            "velocities out")
+    if aside > MOST_ASIDE * measured:
+        raise ProductError(f"{path}: particles move by {measured:.3g} between frames (median), but their velocities "
+                           f"differ from that by {aside:.3g}; correct their order, signs or unit, or set "
+                           'noise = "auto", so that splines of the positions take their place')
