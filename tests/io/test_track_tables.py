@@ -141,6 +141,33 @@ def test_a_file_a_frame_has_its_number_as_time(tmp_path):
     assert_read(found, (TIME + 98) / 2)
 
 
+@pytest.mark.parametrize("names, times", [
+    (["a", "b", "c"], [0, 1, 2]), (["8/t", "9/t", "10/t"], [8, 9, 10]), (["7/1", "7/2", "8/1"], None),
+    (["f0", "f1", "f1_old"], None), (["f0", "f1", "f_mean"], None), (["f1", "f01", "f2"], None)])
+def test_numbers_of_files_are_different_or_none_has_one(tmp_path, names, times):
+    for number, name in enumerate(names):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / f"{name}.csv").write_text(f"track,x,y,z\n0,{number},2,3\n")
+    path = tmp_path / ("*/*.csv" if "/" in names[0] else "*.csv")
+    if times is None:
+        with pytest.raises(ProductError, match="no times, and no number in their names .* keep other files out"):
+            read_tracks(path)
+    else:
+        found = read_tracks(path)
+        assert [found.time.tolist(), found.position[:, 0].tolist()] == [times, [0, 1, 2]]
+
+
+@pytest.mark.parametrize("short, words", [
+    ("track,time,x,y,z\n0,1,1,2,3\n", "f1.csv has no u, v, w, but"),
+    ("track,x,y,z,u,v,w\n0,1,2,3,4,5,6\n", "f1.csv has no times, but")])
+def test_files_of_a_series_have_the_same_columns(tmp_path, short, words):
+    for frame in (0, 2):
+        (tmp_path / f"f{frame}.csv").write_text(f"track,time,x,y,z,u,v,w\n0,{frame},1,2,3,4,5,6\n")
+    (tmp_path / "f1.csv").write_text(short)
+    with pytest.raises(ProductError, match=words):
+        read_tracks(tmp_path / "f*.csv")
+
+
 def test_openlpt_numbers_the_tracks_of_each_file_anew(tmp_path):
     for name in ("LongTrackActive_9.csv", "LongTrackInactive_9.csv"):
         (tmp_path / name).write_text("TrackID,FrameID,WorldX,WorldY,WorldZ\n" + rows(TRACK, TIME, *POSITION.T))

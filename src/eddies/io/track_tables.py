@@ -21,7 +21,7 @@ from typing import BinaryIO, TextIO
 
 import numpy as np
 
-from eddies.io.file_patterns import matching_files
+from eddies.io.file_patterns import matching_files, short_names
 
 try:
     import pandas
@@ -175,11 +175,19 @@ def read_table(path: Path, columns: Mapping[str, str | int] | None = None, frame
     parts = [part for part in parts if part.rows]
     if not parts:
         return np.zeros(0), np.zeros(0), np.zeros((0, 3)), None
+    for what, lacking in (("u, v, w", [part.name for part in parts if "u" not in part.columns]),
+                          ("times", [part.name for part in parts if part.counts_frames])):
+        if 0 < len(lacking) < len(parts):
+            raise ValueError(f"{lacking[0]} has no {what}, but other files of the series have them ({len(lacking)} "
+                             "such files); give them in all files or in none")
     _number_zones(parts)
     _number_tracks(parts)
     names = [name for name in (*NEEDED, *VELOCITY) if all(name in part.columns for part in parts)]
     values = {name: _joined([part.columns.pop(name) for part in parts]) for name in names}
     time, track = values["time"], values["track"]
+    if np.isnan(time).any():
+        raise ValueError("the files have no times, and no number in their names that is another one in each; give each "
+                         "the number of its frame, and keep other files out of the path")
     position, velocity = (np.stack([values.pop(name) for name in group], axis=1) if group[0] in values else None
                           for group in (POINT, VELOCITY))
     if frame_rate is not None:
@@ -223,14 +231,16 @@ class _Part:
     Parameters
     ----------
     columns : arrays (rows,) by name, among them `x` and, except in Tecplot files, `time`.
-    number : number in the name of the file; None for a single file.
+    name, number : name of the file, and the number of its frame by its name; None for a single file, NaN if the names
+        do not give it.
     zones : rows of each zone of a Tecplot file without times.
     first, per_frame : as in `Program`. own_ids : whether the file numbers its tracks on its own.
     counts_frames : whether the times are numbers of frames.
     """
 
     columns: dict[str, np.ndarray]
-    number: int | None
+    name: str
+    number: float | None
     zones: list[int]
     first: int = 0
     per_frame: bool = False
@@ -243,7 +253,7 @@ class _Part:
         return len(self.columns["x"])
 
     @classmethod
-    def read(cls, file: Path, number: int | None, given: Mapping[str, str | int], ids: dict[str, float]) -> _Part:
+    def read(cls, file: Path, number: float | None, given: Mapping[str, str | int], ids: dict[str, float]) -> _Part:
         """Read a file. `given` holds the columns that the user names, `ids` the numbers of tracks with texts as ids, to
         which new ones are added."""
         heading = heading_of(file)
@@ -253,7 +263,7 @@ class _Part:
                   else _places(heading, given, [name for name in NEEDED if not (timed and name == "time")])
                   if heading.rows or heading.names else {})
         if not heading.rows:
-            return cls({"x": np.zeros(0)}, number, [])
+            return cls({"x": np.zeros(0)}, file.name, number, [])
         if "next" in places and number is None:
             raise ValueError("the file holds one frame; give the files of all frames, with * in place of their number")
         columns, zones = _read(file, heading, places, ids)
@@ -262,7 +272,8 @@ class _Part:
             columns["time"] = columns.pop("frame")
         elif counts and not heading.zones:
             columns["time"] = np.full(len(columns["x"]), float(number or 0))
-        return cls(columns, number, zones, program.first if program else 0, program is not None and program.per_frame,
+        return cls(columns, file.name, number, zones, program.first if program else 0,
+                   program is not None and program.per_frame,
                    OWN_IDS <= {plain(name) for name in heading.names}, counts)
 
 
@@ -272,7 +283,7 @@ def _number_zones(parts: Sequence[_Part]) -> None:
     before = 0
     for part in parts:
         if "time" not in part.columns:
-            alone = part.number is not None and len(part.zones) == 1
+            alone = part.number is not None and (len(part.zones) == 1 or math.isnan(part.number))
             numbers = np.arange(len(part.zones)) + (part.number if alone else before)
             part.columns["time"], before = np.repeat(numbers.astype(float), part.zones), before + len(part.zones)
 
@@ -413,11 +424,14 @@ def _number(field: str) -> float:
         return math.nan
 
 
-def _file_numbers(files: Sequence[Path]) -> list[int]:
-    """Return the number of each file of a series: the last number in its name that is another one in each file."""
-    differing = [numbers for numbers in zip(*(re.findall(r"\d+", file.name) for file in files))
-                 if len(set(numbers)) == len(files)]
-    return [int(number) for number in differing[-1]] if differing else list(range(len(files)))
+def _file_numbers(files: Sequence[Path]) -> list[float]:
+    """Return the number of each file of a series: the last number in its name that is another one in each file. If no
+    name has a number, files are counted; NaN if numbers are not different, or are missing in some names."""
+    found = [[float(number) for number in re.findall(r"\d+", name)] for name in short_names(files)]
+    differing = [[*numbers] for numbers in zip(*found) if len(set(numbers)) == len(files)]
+    if differing:
+        return differing[-1]
+    return [math.nan] * len(files) if any(found) else [float(number) for number in range(len(files))]
 
 
 # ---- numbers

@@ -49,6 +49,17 @@ def test_the_window_without_training_is_the_default_of_training():
     assert stage_fingerprint(alone, "train-kernel") == stage_fingerprint(scene, "train-kernel")
 
 
+def test_files_of_a_series_with_equal_names_all_count(tmp_path):
+    (tmp_path / "a.toml").write_text(f'[tracks]\npath = "{tmp_path}/*/t.csv"\nbox = 1\n')
+    found = set()
+    for texts in (("one", "two"), ("another", "two"), ("one", "another")):
+        for folder, text in zip("12", texts):
+            (tmp_path / folder).mkdir(exist_ok=True)
+            (tmp_path / folder / "t.csv").write_text(text)
+        found.add(stage_fingerprint(load_scene(tmp_path / "a.toml"), "dns"))
+    assert len(found) == 3
+
+
 @pytest.mark.parametrize("key, name, first", [("initial.path", "start.h5", "dns"), ("model.path", "model.h5", "train"),
                                               ("simulation.step_from", "step.h5", "simulate")])
 def test_the_content_of_files_counts_not_their_place(tmp_path, key, name, first):

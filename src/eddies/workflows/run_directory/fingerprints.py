@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from eddies.import_path import origins
-from eddies.io.file_patterns import FileVersion, file_versions
+from eddies.io.file_patterns import FileVersion, file_versions, short_names
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene, Tracers
 from eddies.scene.sections import SET_KEYS
@@ -107,10 +107,10 @@ def _digest(path: str | Path | None) -> str | None:
 
 @lru_cache(maxsize=4)  # the files may be large, and a run asks several times
 def _digest_of_versions(versions: tuple[FileVersion, ...]) -> str:
-    digests = {}
-    for path, *_ in versions:
+    files, digests = [path for path, *_ in versions], {}
+    for path, name in zip(files, short_names(files)):
         with open(path, "rb") as file:
-            digests[path.name] = hashlib.file_digest(file, "sha256").hexdigest()
+            digests[name] = hashlib.file_digest(file, "sha256").hexdigest()
     if len(digests) == 1:
-        return digests[path.name]
+        return digests[name]
     return hashlib.sha256(json.dumps(digests).encode()).hexdigest()
