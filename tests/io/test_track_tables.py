@@ -60,11 +60,16 @@ def test_myptv_has_no_names_and_velocities_of_a_frame(tmp_path):
     assert_read(read_tracks(tmp_path / "trajectories"))
 
 
-def test_rows_without_a_track_are_counted(tmp_path, caplog):
+@pytest.mark.parametrize("begin", ["", "p"], ids=["numbers", "texts"])
+def test_rows_without_a_track_are_counted(tmp_path, caplog, begin):
     caplog.set_level(logging.INFO, "eddies")
-    (tmp_path / "a.csv").write_text("track,time,x,y,z\n" + rows(TRACK, TIME, *POSITION.T) + "-1,0,1,1,1\n,0,2,2,2\n")
-    assert_read(read_tracks(tmp_path / "a.csv"))
-    assert [line for line in caplog.messages if "a.csv: 2 of 14 rows belong to no track" in line]
+    ids, lost = [f"{begin}{track}" for track in TRACK], (["", "-1", "nan"], 3 * [0], *np.ones((3, 3)))
+    for name, columns in (("first", [0, 1, 2, 3, 4]), ("last", [1, 2, 3, 4, 0])):
+        texts = [rows(*(each[place] for place in columns)) for each in (lost, (ids, TIME, *POSITION.T))]
+        (tmp_path / name).write_text(rows(*([("track", "time", "x", "y", "z")[place]] for place in columns))
+                                     + texts[0] + texts[1] + texts[0])
+        assert_read(read_tracks(tmp_path / name))
+        assert [line for line in caplog.messages if f"{name}: 6 of 18 rows belong to no track" in line]
 
 
 LINKED = {1: [(-1, 1, 0), (-1, -2, 1), (-1, 0, 2)], 2: [(2, 0, 3), (0, -2, 4)], 3: [(0, -2, 5), (-1, -2, 6)],
@@ -110,13 +115,14 @@ def test_xuap_counts_rows_from_one_and_marks_smoothed_ones(tmp_path):
 
 
 @pytest.mark.parametrize("ends", ["\n", "\r\n"], ids=["LF", "CRLF"])
-@pytest.mark.parametrize("times", ["", "\n SOLUTIONTIME = {:.1e}"], ids=["no times", "times"])
-def test_zones_of_tecplot_are_frames(tmp_path, times, ends):
+@pytest.mark.parametrize("letter", ["", "e", "D"], ids=["no times", "times", "Fortran"])
+def test_zones_of_tecplot_are_frames(tmp_path, letter, ends):
     """As in the data assimilation challenge; one file or several, with a title in each."""
-    zones = [f'ZONE T="snapshot {frame}", I={COUNT}, F=POINT{times.format(0.1 * frame)}\n'
+    times = [f"\n SOLUTIONTIME = {0.1 * frame:.1e}".replace("e", letter) if letter else "" for frame in range(FRAMES)]
+    zones = [f'ZONE T="snapshot {frame}", I={COUNT}, F=POINT{times[frame]}\n'
              + rows(*POSITION[TIME == frame].T, TRACK[TIME == frame], mark=" ") for frame in range(FRAMES)]
     head = 'TITLE = "a case"\nVARIABLES = "X [mm]", "Y [mm]"\n"Z [mm]"\nPartID\n'
-    expected = TIME * 0.1 if times else TIME
+    expected = TIME * 0.1 if letter else TIME
     for name, parts in (("all.dat", [zones]), ("two_*.dat", [zones[:2], zones[2:]]),
                         ("each*.dat", [[zone] for zone in zones])):
         for number, part in enumerate(parts):
@@ -179,6 +185,7 @@ def test_openlpt_numbers_the_tracks_of_each_file_anew(tmp_path):
     assert_read(read_tracks(tmp_path / "f*.csv"))
 
 
+ZONES = b"VARIABLES = X Y Z PartID\n"
 COLUMNS = {"track": "Who", "time": "When", "x": "P1", "y": "P2", "z": "P3"}
 
 
@@ -190,7 +197,8 @@ def test_columns_are_given_by_name_or_number(tmp_path):
     numbers = {"x": 1, "y": 2, "z": 3, "time": 4, "track": 5}
     for name in ("named.csv", "bare.csv"):
         assert_read(read_tracks(tmp_path / name, columns=numbers))
-    found = read_tracks(tmp_path / "bare.csv", columns=numbers | {"u": 3, "v": 2, "w": 1}, frame_rate=4)
+    (tmp_path / "bare.csv").write_text(rows(*POSITION.T, TIME, TRACK, *POSITION.T))
+    found = read_tracks(tmp_path / "bare.csv", columns=numbers | {"u": 8, "v": 7, "w": 6}, frame_rate=4)
     assert_read(found, TIME / 4)
     np.testing.assert_array_equal(found.velocity, POSITION[:, ::-1])
 
@@ -208,6 +216,7 @@ def test_ids_that_are_texts_are_numbered(tmp_path):
 
 
 TEXT = "Spur;Zeit (µs);x;y;z\n;;mm;mm;mm\n" + rows(TRACK, TIME, *POSITION.T, mark=";")
+FORTRAN = "Spur;Zeit;x;y;z\n" + rows(TRACK, TIME, *np.char.mod("%.6E", POSITION.T), mark=";").replace("E", "D")
 GERMAN = {"track": "Spur", "time": "Zeit"}
 
 
@@ -216,8 +225,9 @@ GERMAN = {"track": "Spur", "time": "Zeit"}
     codecs.BOM_UTF8 + TEXT.encode(), TEXT.replace("\n", "\r\n").encode(), TEXT.replace("\n", ";\r\n").encode(),
     gzip.compress(TEXT.encode("latin-1")), TEXT.replace(".", ",").encode("latin-1"),
     TEXT.replace(".", ",").replace(";", "\t").encode(), TEXT.replace(";;mm", "- - mm").replace(" (µs)", "").replace(
-        ".", ",").replace(";", " ").encode(), TEXT.replace(";", " ; ").encode()],
-    ids=["UTF-8", "Latin-1", "UTF-16", "UTF-16 BE", "BOM", "CRLF", "ends", "gzip", "comma", "tab", "blank", "wide"])
+        ".", ",").replace(";", " ").encode(), TEXT.replace(";", " ; ").encode(), FORTRAN.encode()],
+    ids=["UTF-8", "Latin-1", "UTF-16", "UTF-16 BE", "BOM", "CRLF", "ends", "gzip", "comma", "tab", "blank", "wide",
+         "Fortran"])
 def test_texts_of_all_kinds_are_read(tmp_path, content):
     for name in ("a.csv", "a.csv.gz", "a"):
         (tmp_path / name).write_bytes(content)
@@ -236,8 +246,14 @@ def test_texts_of_all_kinds_are_read(tmp_path, content):
      "row 2 has no number in the column of x .1 such rows|'' to float64 at row 1, column 3"),
     (b"track,time,x,y,z\n0,0.25,1,2,3\n", {"frame_rate": 500}, "time 0.25 is no number of a frame.*remove frame_rate"),
     (b"track,x,y,z\n0,1,2,3\n", {}, "names track, x, y, z; add or correct time"),
-    (b"track,time,x,y,z\n0,0,1,2,three\n", {}, "cannot be read as csv: .*three")],
-    ids=["UTF-16", "cut", "bare", "name", "number", "velocity", "empty", "rate", "time", "word"])
+    (b"track,time,x,y,z\n0,0,1,2,three\n", {}, "cannot be read as csv: .*three"),
+    (b"track,time,x,y,z\n0,0,1,2,3\n", {"columns": {"x": "y"}}, "columns.x = 'y': this column is that of y too; give"),
+    (b"track,time,x,y,z\n0,0,1,2,3\n", {"columns": {"vx": 3}}, "columns.vx = 3: must be one of track, time, x, y"),
+    (b"track,time,x,y,z\n0,0,inf,2,3\n", {}, "row 1 has no number in the column of x"),
+    (ZONES + b"ZONE SOLUTIONTIME=0\n1 2 3 7\nZONE\n1 2 3 7\n", {}, "a.csv: some zones have a SOLUTIONTIME and others"),
+    (ZONES + b"ZONE\n1 2 3 7\nZONE SOLUTIONTIME=1\n1 2 3 7\n", {}, "a.csv: some zones have a SOLUTIONTIME and others")],
+    ids=["UTF-16", "cut", "bare", "name", "number", "velocity", "empty", "rate", "time", "word", "twice", "unknown",
+         "infinite", "second zone", "first zone"])
 def test_what_cannot_be_read_is_named_with_the_remedy(tmp_path, content, keys, words):
     (tmp_path / "a.csv").write_bytes(content)
     with pytest.raises(ProductError, match=words) as caught:

@@ -17,6 +17,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import mode
 from typing import BinaryIO, TextIO
 
 import numpy as np
@@ -41,13 +42,15 @@ OWN_IDS = {"trackid", "frameid", "worldx"}   # names that show a table of OpenLP
 HEAD, ROWS = 2**16, 50  # bytes, and rows after the heading, from which the layout is found
 LEAST_NUMBERS = 3       # least number of numbers in a row
 NO_ID = -1              # id of a row that belongs to no track
+NO_NAMES = ("", "nan", "na", "none", "null")   # texts, in small letters, in place of NO_ID
 COMMENTS = "#%"
 GZIP = b"\x1f\x8b"      # first bytes of a compressed file
 MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
-DECIMAL = re.compile(r"[-+]?\d*,?\d+(?:[eE][-+]?\d+)?")   # a number, perhaps with a decimal comma
+DECIMAL = re.compile(r"[-+]?\d*,?\d+(?:[eEdD][-+]?\d+)?")   # a number, perhaps with a decimal comma
+FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[-+]?\d+$)")   # the letter of an exponent of Fortran
 VARIABLES = re.compile(r"^\s*variables\s*=(.*?)(?=^\s*\w+\s*=|^\s*zone\b|\Z)", re.IGNORECASE | re.DOTALL | re.MULTILINE)
 ZONE = re.compile(r"((?:^[ \t]*[A-Za-z\"#].*\n?)+)", re.MULTILINE)
-SOLUTION_TIME = re.compile(r"solutiontime\s*=\s*([-+.\deE]+)", re.IGNORECASE)
+SOLUTION_TIME = re.compile(r"solutiontime\s*=\s*([-+.\ded]+)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,11 @@ class Heading:
     decimal: str = "."
 
     @property
+    def width(self) -> int:
+        """Number of fields of most rows: a row with an empty last field has one less."""
+        return mode(map(len, self.rows)) if self.rows else 0
+
+    @property
     def zones(self) -> bool:
         """Whether it is a Tecplot file."""
         return bool(VARIABLES.search("".join(self.lines)))
@@ -115,7 +123,7 @@ class Heading:
         listed = VARIABLES.search("".join(self.lines))
         if listed:
             return [(quoted or bare).lower() for quoted, bare in re.findall(r'"([^"]*)"|([^\s,"]+)', listed[1])]
-        width = len(self.rows[0]) if self.rows else 0
+        width = self.width
         lines = [(line.lstrip()[:1] in COMMENTS, _fields(line.strip(COMMENTS + " \r\n"), self.delimiter))
                  for line in self.lines if line.strip() and not self.counted]
         fitting = [line for _, line in lines if not width or width - len(line) in (0, 1)]
@@ -148,9 +156,8 @@ def heading_of(path: Path) -> Heading:
         del lines[-1]
     for number, line in enumerate(lines):
         delimiter = _delimiter(line)
-        if line.lstrip()[:1] not in (*COMMENTS, "") and sum(
-                not math.isnan(_number(field)) for field in _fields(line, delimiter)) >= LEAST_NUMBERS:
-            rows = tuple(_fields(each, delimiter) for each in lines[number:number + ROWS] if each.strip())
+        if _is_row(line, delimiter):
+            rows = tuple(_fields(each, delimiter) for each in lines[number:number + ROWS] if _is_row(each, delimiter))
             decimal = "," if delimiter != "," and any("," in field for field in rows[0]) else "."
             return Heading(encoding, tuple(lines[:number]), rows, delimiter, decimal)
     return Heading(encoding, tuple(lines), (), _delimiter(lines[0]) if lines else ",")
@@ -332,7 +339,7 @@ def _places(heading: Heading, given: Mapping[str, str | int], needed: Sequence[s
     Raises ValueError if a column is missing or is there twice.
     """
     names = heading.names
-    width = len(heading.rows[0]) if heading.rows else len(names)
+    width = heading.width or len(names)
     if names and len(names) != width:
         raise ValueError(f"the first line names {len(names)} columns, but the first row has {width}; name each column "
                          "once")
@@ -346,6 +353,8 @@ def _places(heading: Heading, given: Mapping[str, str | int], needed: Sequence[s
                                  "its own (capital letters do not count)")
             found[name] = plains.index(own)
     for name, column in given.items():
+        if name not in (*NEEDED, *VELOCITY):
+            raise ValueError(f"columns.{name} = {column!r}: must be one of {', '.join((*NEEDED, *VELOCITY))}")
         found[name] = _given_place(name, column, names, width)
     if "time" in found:
         found.pop("frame", None)
@@ -358,7 +367,13 @@ def _places(heading: Heading, given: Mapping[str, str | int], needed: Sequence[s
     missing = [name for name in VELOCITY if name not in found]
     if missing and any(name in given for name in VELOCITY):
         raise ValueError(f"columns gives no {missing[0]}; give {', '.join(VELOCITY)}, or none of them")
-    return {name: place for name, place in found.items() if not missing or name not in VELOCITY}
+    found = {name: place for name, place in found.items() if not missing or name not in VELOCITY}
+    for name in given:
+        other = next((each for each in found if each != name and found[each] == found[name]), None)
+        if other is not None:
+            raise ValueError(f"columns.{name} = {given[name]!r}: this column is that of {other} too; give each of them "
+                             "a column of its own")
+    return found
 
 
 def _given_place(name: str, column: str | int, names: Sequence[str], width: int) -> int:
@@ -416,10 +431,16 @@ def _fields(line: str, delimiter: str) -> list[str]:
     return fields[:-1] if fields and not fields[-1] else fields
 
 
+def _is_row(line: str, delimiter: str) -> bool:
+    """Return whether a line is a row with numbers, not a comment or the heading of a zone."""
+    return line.lstrip()[:1] not in (*COMMENTS, "") and sum(
+        not math.isnan(_number(field)) for field in _fields(line, delimiter)) >= LEAST_NUMBERS
+
+
 def _number(field: str) -> float:
-    """Return a number with a decimal point or comma; NaN for another text."""
+    """Return a number with a decimal point or comma, perhaps with an exponent of Fortran; NaN for another text."""
     try:
-        return float(field.replace(",", "."))
+        return float(FORTRAN.sub("e", field.strip()).replace(",", "."))
     except ValueError:
         return math.nan
 
@@ -457,9 +478,11 @@ def _read(file: Path, heading: Heading, places: Mapping[str, int], ids: dict[str
             continue
         parts.append(_values(io.StringIO(body), heading, places, ids))
         rows[-1] += len(parts[-1]["x"])
-        stated = SOLUTION_TIME.search(head)
+        stated = SOLUTION_TIME.findall(head)
         if stated and "time" not in places:
-            parts[-1]["time"] = np.full(len(parts[-1]["x"]), float(stated[1]))
+            parts[-1]["time"] = np.full(len(parts[-1]["x"]), float(FORTRAN.sub("e", stated[-1])))
+    if 0 < sum("time" in part for part in parts) < len(parts):
+        raise ValueError(f"{file.name}: some zones have a SOLUTIONTIME and others have none; give it in all zones")
     return {name: _joined([part[name] for part in parts]) for name in parts[0]}, rows
 
 
@@ -468,12 +491,18 @@ def _values(lines: TextIO, heading: Heading, places: Mapping[str, int], ids: dic
     used = sorted({*places.values()})
     delimiter = None if heading.delimiter == " " else heading.delimiter
     place = places.get("track")
-    texts = place is not None and math.isnan(_number(heading.rows[0][place]))
-    numbering = {place: lambda entry: ids.setdefault(entry.strip(), float(len(ids)))} if texts else {}
+    texts = place is not None and any(
+        math.isnan(_number(row[place])) and row[place].lower() not in NO_NAMES for row in heading.rows
+        if len(row) > place)
+    numbering = ({number: _number for number in used if number != place} if any(
+        FORTRAN.search(row[number]) for row in heading.rows for number in used if place != number < len(row)) else {})
+    if texts:
+        numbering[place] = lambda entry: (NO_ID if entry.strip().lower() in NO_NAMES or _number(entry) < 0
+                                          else ids.setdefault(entry.strip(), float(len(ids))))
     if pandas is None:
         points = (line.replace(",", ".") for line in lines) if heading.decimal == "," else lines
         if place is not None and not texts:  # the id of a row without a track may be empty
-            numbering[place] = lambda entry: float(entry or "nan")
+            numbering[place] = lambda entry: NO_ID if entry.lower() in NO_NAMES else float(entry)
         table = np.loadtxt(points, delimiter=delimiter, usecols=used, ndmin=2, quotechar='"',
                            converters=numbering or None)
         found = dict(zip(used, table.T))
@@ -483,7 +512,7 @@ def _values(lines: TextIO, heading: Heading, places: Mapping[str, int], ids: dic
                                 dtype={number: float for number in used if number not in numbering})
         found = {number: frame.pop(number).to_numpy() for number in used}
     for name, number in places.items():
-        bad = np.flatnonzero(np.isnan(found[number]))
+        bad = np.flatnonzero(~np.isfinite(found[number]))
         if name == "track":
             found[number] = np.where(np.isnan(found[number]), NO_ID, found[number])
         elif len(bad):
