@@ -147,13 +147,16 @@ def test_hdf5_of_another_program_is_told_what_it_lacks(tmp_path):
         read_tracks(tmp_path / "a.h5")
 
 
-def test_keys_of_tables_are_refused_for_other_files(tmp_path):
+def test_keys_that_a_file_does_not_use_are_refused(tmp_path):
     write_tracks(tmp_path / "a1.h5", *shear(np.array([0.0, 0.1])))
     write_tracks(tmp_path / "a2.h5", *shear(np.array([0.0, 0.1])))
     np.savez(tmp_path / "a.npz", pos=np.zeros((2, 2, 3)), time=np.arange(2))
     for name, keys, words in (("a1.h5", {"frame_rate": 2.0}, "h5md, whose frames have times; remove frame_rate"),
                               ("a1.h5", {"columns": {"x": 1}}, "columns is for tables only"),
                               ("a.npz", {"frame_rate": 2.0}, "holds an array time; remove frame_rate"),
+                              ("a.npz", {"frame_rate": 0.0}, "frame_rate = 0.0: must be a positive number"),
+                              ("a.npz", {"frame_rate": np.nan}, "frame_rate = nan: must be a positive number"),
+                              ("a.npz", {"group": "b"}, "has the layout npz, without groups; remove group"),
                               ("a*.h5", {}, "names 2 files, but only tables may be several")):
         with pytest.raises(ProductError, match=words):
             read_tracks(tmp_path / name, **keys)

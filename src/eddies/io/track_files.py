@@ -37,6 +37,7 @@ from eddies.io.trajectories import ROUNDING, write_h5md_header
 
 SUFFIXES = {".npz": "npz", ".nc": "proptv", **dict.fromkeys((".csv", ".txt", ".dat", ".tsv"), "csv")}
 TIMED = ("h5md", "lagrangebench", "proptv")   # layouts whose frames have times
+GROUPED = ("h5md", "lagrangebench")     # layouts with groups of particles or trajectories
 METADATA = "metadata.json"              # file beside those of LagrangeBench
 ROWS = ("trajectories", "particles")    # groups or tables of flowtracks
 FILL = -1  # the id of a row without a particle
@@ -115,6 +116,11 @@ def read_tracks(path: str | Path, layout: str | None = None, group: str | None =
             layout = layout or _layout_of(max(files, key=lambda file: file.stat().st_size))
             if layout not in LAYOUTS:
                 raise ProductError(f"{path}: layout = {layout!r}: must be one of {', '.join(LAYOUTS)}")
+            if frame_rate is not None and not 0 < frame_rate < math.inf:
+                raise ProductError(f"{path}: frame_rate = {frame_rate}: must be a positive number; give the frames per "
+                                   "unit of time")
+            if group is not None and layout not in GROUPED:
+                raise ProductError(f"{path}: has the layout {layout}, without groups; remove group")
             if layout == "csv":
                 found = Tracks(*read_table(path, columns, frame_rate))
             elif len(files) > 1 and layout != "proptv":
