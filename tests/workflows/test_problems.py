@@ -206,7 +206,9 @@ def test_a_volume_whose_cube_does_not_fit_is_refused(comm, tmp_path):
 @pytest.mark.mpi(1)
 def test_a_table_of_points_is_read_before_the_run(comm, tmp_path):
     scene = load_scene(TINY, ["reconstruction.method=least-squares", f"reconstruction.points={tmp_path / 'p.csv'}"])
-    for text, words in ((None, "p.csv: cannot be read: No such file"), ("x,y\n1,2,3\n", "cannot be read as a table")):
+    for text, words in ((None, "p.csv: cannot be read: No such file"), ("x,y\n1,2,3\n", "cannot be read as a table"),
+                        ("x,y,z\n1,2,3\n1,inf,3\n", "row 2 has no number in the column of y"),
+                        ("x,y,z\n1,2,3\n1,-1e8,3\n", "(1, -1e+08, 3) is outside the 1e+06 edges around the cube")):
         if text:
             (tmp_path / "p.csv").write_text(text)
         (line,), _ = problems_of(scene, comm)

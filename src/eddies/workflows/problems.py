@@ -235,8 +235,8 @@ def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str
             given_spectrum(initial, comm)
         points = scene.reconstruction.points_file if "reconstruct" in stages else None
         if points is not None:
-            from eddies.io.track_files import read_points  # imports pandas
-            on_first_rank(comm, partial(read_points, points))
+            from eddies.workflows.track_source import check_points  # imports torch
+            on_first_rank(comm, partial(check_points, points, scene.tracks))
         if weights is not None and weights not in made and on_first_rank(comm, weights.is_file):
             read_source(scene.name, ModelDefinition.of(scene), comm)
         if "simulate" in stages and (path := scene.simulation.step_file) is not None and path not in made:

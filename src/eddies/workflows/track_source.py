@@ -16,11 +16,39 @@ from eddies.parallel.communicator import Comm
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.scene.scene import BOX_LENGTH, Reconstruction, SceneError, Tracers, Tracks
-from eddies.workflows.ground_truth.track_frames import TrackFrames, count_for, surest
+from eddies.workflows.ground_truth.track_frames import TrackFrames, count_for, read_measured, surest
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.track_solver import NO_FILTER, best_solver, particles_on, slabs_for, solver_of
 
 NEAREST = 0.500001  # largest distance in time between a point and its frame, in frame intervals
+FAR = 1e6           # largest coordinate of a point in a periodic cube, in edges; wrapping takes its digits
+
+
+def read_placed(path: Path, unit: float, corner: np.ndarray, periodic: bool,
+                times: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+    """Read points: their places in the run's cube, in its units, and their frames, or None if a point is in all of
+    them. Without the `times` of the frames they are not found. `unit`, `corner`, `periodic` are those of a `Source`.
+
+    Raises ProductError if the file cannot be read, SceneError for a point outside.
+    """
+    time, position = read_points(path)
+    placed, frames, span = (position + corner) / unit, None, ""
+    bad = ((np.abs(placed) > FAR * BOX_LENGTH) if periodic else (placed < 0) | (placed >= BOX_LENGTH)).any(1)
+    if time is not None and times is not None:
+        frames, span = np.abs(times - time[:, None]).argmin(1), f", or the times from 0 to {times[-1]:g}"
+        bad |= np.abs(times[frames] - time) > NEAREST * np.diff(times).max(initial=0.0)
+    if bad.any():
+        row, around = int(np.argmax(bad)), f"{FAR:g} edges around the cube" if periodic else "cube around the volume"
+        place, when = ", ".join(f"{x:.4g}" for x in position[row]), "" if time is None else f", {time[row]:g}"
+        raise SceneError(f"[reconstruction] points: {path}: ({place}{when}) is outside the {around}{span} "
+                         f"({bad.sum()} such points); remove it")
+    return placed, frames
+
+
+def check_points(path: Path, tracks: Tracks | None) -> None:
+    """Raise an error if points cannot be used, whatever their times are; one rank calls it."""
+    about = {"length_unit": 1.0, "corner": np.zeros(3)} if tracks is None else read_measured(tracks).about
+    read_placed(path, about["length_unit"], about["corner"], tracks is None or tracks.volume is None)
 
 
 class GivenPoints:
@@ -32,26 +60,14 @@ class GivenPoints:
     ----------
     most : largest number of points in a frame.
 
-    Raises ProductError if the file cannot be read, SceneError if a point is outside the cube, or if its time is outside
-    the frames.
+    Raises the errors of `read_placed`.
     """
 
     def __init__(self, source: Source, path: Path, times: np.ndarray) -> None:
         self._slab = source.slab
-        time, position = in_files(self._slab.comm, path, lambda: read_points(path))
-        self._position, self._frames = (position + source.corner) / source.unit, None
-        bad = np.zeros(len(position), bool)
-        if not source.periodic:
-            bad = ((self._position < 0) | (self._position >= BOX_LENGTH)).any(1)
-        if time is not None:
-            self._frames = np.abs(times - time[:, None]).argmin(1)
-            bad |= np.abs(times[self._frames] - time) > NEAREST * np.diff(times).max(initial=0.0)
-        if bad.any():
-            row = int(np.argmax(bad))
-            place, when = ", ".join(f"{x:.4g}" for x in position[row]), "" if time is None else f", {time[row]:g}"
-            raise SceneError(f"[reconstruction] points: {path}: ({place}{when}) is outside the cube around the volume, "
-                             f"or the times from 0 to {times[-1]:g} ({bad.sum()} such points); remove it")
-        self.most = len(position) if self._frames is None else int(np.bincount(self._frames).max())
+        self._position, self._frames = in_files(self._slab.comm, path, lambda: read_placed(
+            path, source.unit, source.corner, source.periodic, times))
+        self.most = len(self._position) if self._frames is None else int(np.bincount(self._frames).max())
 
     def at(self, number: int) -> ParticleSet:
         """Return this rank's points in frame `number` of `times`, as particles at rest; the id is the row of the file,
