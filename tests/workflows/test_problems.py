@@ -136,7 +136,7 @@ def test_steps_that_are_too_long_for_a_forced_rollout_or_for_a_term(comm, warned
 def test_the_step_of_another_run_is_one_of_the_same_kind_of_method(comm, tmp_path):
     def refusals(*overrides):
         given = ["simulation.step=converged", f"simulation.step_from={tmp_path}", *overrides]
-        return [line for line in problems_of(load_scene(TINY, given), comm)[0] if "step_from" in line]
+        return [line for line in problems_of(load_scene(TINY, given), comm)[0] if "step" in line]
 
     grid = "simulation.method=eulerian", "eulerian.cells=16"
     assert all("no such file; run `eddies find-step" in line for line in refusals()) and refusals()

@@ -175,8 +175,11 @@ def test_a_dns_alone(comm, tmp_path):
     assert metrics.keys() == {"warnings", "ground_truth", "cost", "row"} and metrics["warnings"] == []
     assert metrics["cost"]["dns_seconds_per_step"] > 0 and metrics["cost"]["stage_seconds"] is None
     (tmp_path / "stage_seconds.json").write_text('{"dns": 12.5}')
+    with changed(tmp_path / "ground_truth.h5") as file:  # the first sample is the start
+        file["statistics/seconds_per_step"][:] = [9.0, *40 * [1.0], *40 * [2.0]]
     report.run(tmp_path, comm)
-    assert written(tmp_path)[0]["cost"]["stage_seconds"] == {"dns": 12.5}
+    cost = written(tmp_path)[0]["cost"]
+    assert cost["stage_seconds"] == {"dns": 12.5} and cost["dns_seconds_per_step"] == 1.5
     before = (tmp_path / "report" / "index.html").read_bytes()
     report.run(tmp_path, comm, output=tmp_path / "elsewhere" / "page")
     assert (tmp_path / "elsewhere" / "page" / "index.html").read_text().count("<img") == 3

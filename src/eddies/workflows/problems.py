@@ -249,18 +249,13 @@ def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str
 
 
 def _unfit_step(settings: Simulation, path: Path, comm: Comm) -> Iterator[str]:
-    """Yield a problem if the converged step of another run cannot be read, or is that of another kind of method."""
-    key = f"[simulation] step_from = {quoted(settings.step_from)}"
-    try:
-        integrator = read_found_step(path, comm)[0]["integrator"]
-    except UserError as error:
-        yield f"{key}: {error}"
-        return
+    """Yield a problem if the converged step of another run is that of another kind of method."""
+    integrator = read_found_step(path, comm)[0]["integrator"]
     if (integrator in SCHEMES) == settings.form.on_grid:
         kinds = "particles", "a coarse grid"
         of, needed = kinds if settings.form.on_grid else kinds[::-1]
-        yield (f"{key}: has the converged step of {of} ({integrator}), and this rollout is one of {needed}; name a run "
-               "of the same method, or remove step_from")
+        yield (f"[simulation] step_from = {quoted(settings.step_from)}: has the converged step of {of} ({integrator}), "
+               f"and this rollout is one of {needed}; name a run of the same method, or remove step_from")
 
 
 # ---- reasons to doubt a result

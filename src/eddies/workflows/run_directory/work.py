@@ -172,8 +172,8 @@ def _scene_of(directory: Path) -> str | None:
 def newer_products(report: Path) -> list[Path]:
     """Return the products in a run directory, also those of variants, that are newer than this file of its report."""
     made = report.stat().st_mtime
-    return [path for name in FILE_OF.values() for path in report.parent.parent.rglob(name)
-            if path.is_file() and path.stat().st_mtime > made]
+    return [path for path in report.parent.parent.rglob("*.h5")
+            if path.name in FILE_OF.values() and path.is_file() and path.stat().st_mtime > made]
 
 
 def step_path(settings: Simulation, directory: Path) -> Path | None:
